@@ -16,7 +16,7 @@ from .core import Points, ViewOptions
 from .envs import SimulationVectorEnv, vector_env, view_class
 from .envs.single import plan_of
 from .errors import OptionValueError, UnknownPointError, short_repr
-from .simulation import Model
+from .simulation import Model, check_count
 
 _RECIPES: Final[dict[str, tuple[Model, Points, ViewOptions]]] = {}
 """The registered simulations with their points and options, by name and version."""
@@ -55,13 +55,13 @@ def register_simulation(
     """
     if name is None and hasattr(simulation, "environment_arguments"):  # a variant
         name = simulation.name
-    recipe = f"{name}-v{version}"
-    if not isinstance(name, str) or not re.fullmatch(r"[\w-]+-v\d+", recipe):
+    if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
         raise OptionValueError(
-            f"name= must consist of letters, digits, _ and -, not {short_repr(name)}, and version="
-            f" must be a non-negative integer, not {short_repr(version)}"
+            f"name= must consist of letters, digits, _ and -, not {short_repr(name)}"
         )
+    check_count(version, "version")
     plan = plan_of(simulation, points, options)
+    recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options
     origin = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
     entry_point = f"{__name__}:make_view"

@@ -93,11 +93,7 @@ class Joint:
         used = () if episode.round is None else episode.round.acted
         for name in self.roster:
             agent = episode.agents.get(name) or episode.ended[name]
-            observation = agent.observation
-            if observation is None:
-                observations[name] = agent.point.blank()
-            else:
-                observations[name] = duplicate(observation)
+            observations[name] = agent.hand_out()
             acted[name] = name in used
             if agent.mask is not None:
                 masks[name] = duplicate(agent.mask)
@@ -211,15 +207,8 @@ class SimulationJointEnv(OneAgentView):
     def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
         """Return the observations, rewards and infos of the latest step of several views."""
         results = [view.read(view.episode) for view in views]
-        return (
-            [observation for observation, *_ in results],
-            [reward for _, reward, *_ in results],
-            [info for *_, info in results],
-        )
-
-    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return how an episode has ended: whether terminated, whether truncated."""
-        return episode.terminated, episode.truncated
+        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
+        return observations, rewards, infos
 
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""

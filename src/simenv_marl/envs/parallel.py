@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from numpy import ndarray
 from pettingzoo import ParallelEnv
 
 from ..core import (
@@ -12,7 +11,6 @@ from ..core import (
     Info,
     Observation,
     Round,
-    duplicate,
 )
 from ..errors import warn_user
 from ..simulation import Sentinel
@@ -129,13 +127,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         rewards = {}
         infos = {}
         for name, agent in agents.items():
-            observation = agent.observation
-            if observation is None:
-                observations[name] = agent.point.blank()
-            elif type(observation) is ndarray:  # spares it a call
-                observations[name] = observation.copy()
-            else:
-                observations[name] = duplicate(observation)
+            observations[name] = agent.hand_out()
             rewards[name] = agent.reward
             info = agent.info
             infos[name] = info

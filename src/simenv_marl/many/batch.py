@@ -377,10 +377,10 @@ class BatchRun:
             agent, key = _pending(episode)
             if not key.batch_policy.alone:
                 group = key.batch_policy.group(agent.point)
-                group.waiting.append((place, episode, agent.observation, agent.take_info()))
+                group.waiting.append((place, episode, agent.raw_observation, agent.take_info()))
                 self._groups[group] = None
                 return
-            arguments = episode, agent, duplicate(agent.observation), agent.take_info()
+            arguments = episode, agent, duplicate(agent.raw_observation), agent.take_info()
             if isinstance(key, AskingKey) and key.waits:
                 self._crowd = min(self.size, max(self._crowd, self.concurrency))
                 self._backlog.append((place, episode, partial(key.begin, *arguments)))
@@ -419,7 +419,7 @@ class BatchRun:
             arrays = {name: np.asarray(value)[None] for name, value in extras.items()}
             group = key.batch_policy.group(agent.point)
             answers = [action], arrays
-            self.watcher.record(group, [place], [episode], [agent.observation], answers)
+            self.watcher.record(group, [place], [episode], [agent.raw_observation], answers)
         episode.step(action)
 
     def _end(self, place: int, episode: Episode) -> None:

@@ -26,7 +26,6 @@ from ..core import (
     Where,
     action_check,
     checked_actions,
-    duplicate,
     is_planner,
     pending_view,
     policy_for,
@@ -216,9 +215,7 @@ class Player:
         if name in self.latest:
             return self.latest[name]
         agent = self.episode.agents.get(name, self.agent)
-        if agent.observation is None:
-            return agent.point.blank(), agent.info
-        return duplicate(agent.observation), agent.info
+        return agent.hand_out(), agent.info
 
     # -- through wrappers -------------------------------------------------------------------------
 

@@ -10,7 +10,6 @@ calls. Both are also on the command line::
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -20,7 +19,7 @@ from ..core import CheckOptions, Point, Points, is_seed
 from ..envs import VIEWS
 from ..envs.single import plan_of
 from ..errors import OptionValueError, short_repr
-from ..simulation import Model
+from ..simulation import Model, check_count, check_seconds
 from .checks import Check
 from .report import (
     CheckReport,
@@ -94,13 +93,9 @@ def check_simulation(
         raise OptionValueError(
             f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}"
         )
-    for name, number in (("episodes", episodes), ("max_steps", max_steps)):
-        if not is_seed(number) or number == 0:
-            raise OptionValueError(f"{name} must be a positive integer, not {short_repr(number)}")
-    if not 0 < time_limit < math.inf:
-        raise OptionValueError(
-            f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
-        )
+    check_count(episodes, "episodes", 1)
+    check_count(max_steps, "max_steps", 1)
+    check_seconds(time_limit, "time_limit")
     check = Check(
         partial(plan_of, simulation, points, options),
         max_steps,

@@ -44,7 +44,15 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
+from ...simulation import (
+    RULE,
+    TRUNCATED,
+    Action,
+    Function,
+    Model,
+    Sentinel,
+    optional_method,
+)
 from ..plans.plan import Plan
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
@@ -94,7 +102,7 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers",
         "_most_steps", "_plugins", "_split", "_tape_size", "called", "driver", "is_plain", "latest",
         "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
@@ -124,7 +132,6 @@ class Episode(EpisodeState):
         self.called: set[Hook] = set()
         self.running = True
         self._failed_in_model = False
-        self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
         self._most_steps = plan.options.max_steps or maxsize
         self.is_plain = not (in_rounds or self.skips)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
@@ -310,12 +317,7 @@ class Episode(EpisodeState):
             self.finish(truncated=True)
             return WAIT
         agent.update(args, kwargs)
-        if self.skips:
-            forced = agent.only_action()
-            agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
-                return agent.reply_to(forced, forced=True)
-        return agent
+        return agent.reply_if_forced() if self.skips else agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -364,13 +366,11 @@ class Episode(EpisodeState):
         is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
         agent.update(args, kwargs, reward=is_rewarded)
         if self.skips:
-            forced = agent.only_action()
-            if is_rewarded:
-                agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
-                return agent.reply_to(forced, forced=True)
+            reply = agent.reply_if_forced()
+            if reply is not agent:
+                return reply
         if isinstance(policy, AskingPolicy):
-            agent.keep(self, args, kwargs)
+            agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
         action = self._consult(agent, policy)
@@ -387,7 +387,7 @@ class Episode(EpisodeState):
                 return WAIT
         else:
             self.consulted = agent
-            observation = duplicate(agent.observation)  # which the policy may change
+            observation = duplicate(agent.raw_observation)  # which the policy may change
             try:
                 if isinstance(policy, EpisodePolicy):
                     action = policy.answer(self, agent, observation, agent.info)
@@ -467,17 +467,6 @@ class Episode(EpisodeState):
             )
         return agent
 
-    def note_entity(self, agent: Agent, entity: Model) -> None:
-        """Note the object as which an agent decides."""
-        self._entities[agent.handler, id(entity)] = agent
-
-    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
-        """Return the name of the agent as which an entity last decided. None if it was none."""
-        agent = self._entities.get((handler, id(entity)))
-        if agent is None or not agent.is_entity(entity):  # a freed object may have had the same id
-            return None
-        return agent.name
-
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
         self.latest = agent
@@ -495,9 +484,11 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        for agent, (args, kwargs) in self._announced().items():
-            if agent is not pending and (in_rounds or not agent.decided):
-                agent.keep(self, args, kwargs)
+        expected_calls = self._expected_calls
+        if expected_calls is not None:
+            for agent, (args, kwargs) in self._announced(expected_calls).items():
+                if agent is not pending and (in_rounds or not agent.decided):
+                    agent.keep(args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return
@@ -514,12 +505,9 @@ class Episode(EpisodeState):
         self.pending = pending
         self.latest = pending or self.latest
 
-    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
+    def _announced(self, expected_calls: Function) -> dict[Agent, tuple[Args, Kwargs]]:
         """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
         announced: dict[Agent, tuple[Args, Kwargs]] = {}
-        expected_calls = self._expected_calls
-        if expected_calls is None:
-            return announced
         for plan_point in self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point

@@ -80,6 +80,7 @@ class Point:
         policy: The policy that answers all decisions of the point. None: the agents' own policies
             answer them, or the environment's user does.
         cast: Casts an observation to the observation space.
+        observes_arrays: Whether observations are arrays.
         check: Checks an action against the action space. Returns it in the form that ``convert``
             takes, or ``ILLEGAL``.
         applies: Whether an ``apply`` gets the action, on the simulation's side.
@@ -110,9 +111,9 @@ class Point:
     __slots__ = (
         "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
         "deliver", "expects_one", "gather", "gives_answers", "hook", "legal", "masked_parts",
-        "name_agent", "needs_simulation", "observation_mapping", "part", "policy", "removed_by",
-        "reports_rule", "reward_mapping", "rule_action_mapping", "split", "taken_keys",
-        "taken_places", "takes_for_observation", "takes_for_reward",
+        "name_agent", "needs_simulation", "observation_mapping", "observes_arrays", "part",
+        "policy", "removed_by", "reports_rule", "reward_mapping", "rule_action_mapping", "split",
+        "taken_keys", "taken_places", "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
 
     def __init__(
@@ -143,6 +144,7 @@ class Point:
         self.agent = agent
         self.policy = policy
         self.cast = spaces.observation_cast(definition.observation_space)
+        self.observes_arrays = isinstance(definition.observation_space, spaces.ArraySpace)
         self.check = actions.action_check(definition.action_space, clips=clips)
         self.applies = definition.apply is not None
         is_invertible = definition.choices is not None or inverse(definition) is not None

@@ -13,6 +13,7 @@ hook gets an interceptor, which sends an event and carries out the reply.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from asyncio import _get_running_loop as running_loop
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
@@ -29,7 +30,7 @@ from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Function, Model, Sentinel
-from .exits import ASYNCIO, LoopExit, SimulationExit, is_exit, make_exit
+from .exits import LoopExit, SimulationExit, is_exit, make_exit
 from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
 
@@ -160,7 +161,7 @@ class Driver(ABC):
 
     __slots__ = (
         "__weakref__", "_context", "_exiting", "_handled", "_home", "_loop", "_outcome", "_prepare",
-        "_refused", "_running_loop", "_spawned", "_stack", "_thread", "_users_loop", "caller",
+        "_refused", "_spawned", "_stack", "_thread", "_users_loop", "caller",
         "ended", "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
     )  # fmt: skip
 
@@ -198,7 +199,6 @@ class Driver(ABC):
         self._exiting = False
         self._prepare: Callable[[], Job] | None = None  # until the job begins
         self._context = Context()  # of the job, until it begins
-        self._running_loop: Callable[[], object] | None = None  # None until asyncio is imported
         self._loop = NO_LOOP  # of the simulation, while it waits
         self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
@@ -336,7 +336,8 @@ class Driver(ABC):
         bind = hook.bind
 
         def decide(args: Args, kwargs: Kwargs) -> Model:
-            if type(exception()) is GeneratorExit:  # see ``interceptor``
+            # See ``interceptor``. The first comparison is the fastest.
+            if exception() is not None and type(exception()) is GeneratorExit:
                 if self._exiting:
                     raise make_exit()
                 return rule(*args, **kwargs)
@@ -349,12 +350,7 @@ class Driver(ABC):
                 bound, named = call
             if away:
                 self._reply_to(getcurrent())
-            running = self._running_loop
-            if running is None and ASYNCIO in modules:
-                running = self._running_loop = modules[ASYNCIO]._get_running_loop
-            looped = running is not None and (
-                running() is not None or self._users_loop[0] is not None
-            )
+            looped = running_loop() is not None or self._users_loop[0] is not None
             if looped:
                 self._loop = swap_loop(self._users_loop)
             leave = self._leave
@@ -370,7 +366,7 @@ class Driver(ABC):
                 raise
             if away:
                 self._reply_to(None)
-            if looped or (running is not None and running() is not None):
+            if looped or running_loop() is not None:
                 self._enter_loop()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)

@@ -18,8 +18,8 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
 from sys import exception, modules
-from threading import Thread, local
-from types import coroutine
+from threading import Thread, get_ident, local
+from types import FrameType, coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 from weakref import WeakSet, ref
 
@@ -157,12 +157,14 @@ class Driver(ABC):
         opened: The resources that the simulation has opened. None before the first one.
         stale: Whether code of an earlier stack may still use the simulation, so that it must be
             made anew.
+        user: The number of the thread that began the latest job.
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_loop", "_outcome", "_prepare",
-        "_refused", "_spawned", "_stack", "_thread", "_users_loop", "caller",
-        "ended", "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
+        "__weakref__", "_context", "_deadlock", "_exiting", "_handled", "_home", "_loop",
+        "_outcome", "_prepare", "_refused", "_spawned", "_stack", "_thread",
+        "_users_loop", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
+        "plugins", "stale", "user",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
@@ -232,6 +234,8 @@ class Driver(ABC):
             prepare: Returns the job. It runs on the stack, too, where decisions follow the rule
                 until it has returned.
         """
+        self.user = get_ident()
+        self._deadlock: str | None = None  # why the job waits for ever
         self._make_stack()
         self._prepare = prepare
         self.events = {}
@@ -241,10 +245,15 @@ class Driver(ABC):
 
     def variables(self) -> Iterator[dict[str, Model]]:
         """Yield the variables of each frame of the suspended simulation."""
-        frame = None if self._stack is None else self._stack.gr_frame
+        frame = self.frame
         while frame is not None:
             yield frame.f_locals
             frame = frame.f_back
+
+    @property
+    def frame(self) -> FrameType | None:
+        """The innermost frame of the simulation while it is suspended."""
+        return None if self._stack is None else self._stack.gr_frame
 
     @property
     def reachable(self) -> bool:
@@ -301,6 +310,8 @@ class Driver(ABC):
                 self.give_up(
                     f"neither decided anything nor ended within {SECONDS_TO_UNWIND} s; it is"
                     " abandoned"
+                    if self._deadlock is None
+                    else "waits for a lock; it is abandoned"
                 )
                 break
             if event is ENDED:
@@ -321,6 +332,10 @@ class Driver(ABC):
     def give_up(self, reason: str) -> None:
         """Note why the job on the stack cannot be unwound."""
         self.given_up = reason
+
+    def note_deadlock(self, text: str) -> None:
+        """Note why the job waits for ever. An interrupt of it becomes an error with this text."""
+        self._deadlock = text
 
     # -- on the simulation's side -----------------------------------------------------------------
 
@@ -423,6 +438,8 @@ class Driver(ABC):
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
+        if self._deadlock is not None and isinstance(error, KeyboardInterrupt):
+            return SimulationError(self._deadlock).with_traceback(error.__traceback__)
         refused = self._refused
         if refused is not None and refused is not error:
             if isinstance(error, SimulationExit):

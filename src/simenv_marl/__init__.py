@@ -62,7 +62,7 @@ __all__ = [
     "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation",
     "Streams", "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env",
     "make_step", "parallel_env", "register_simulation", "reseed_generators", "simulate",
-    "simulate_many", "single_env", "vector_env",
+    "simulate_many", "single_env", "turn_env", "vector_env",
 ]  # fmt: skip
 
 ROOMS = (
@@ -83,7 +83,12 @@ _MODULES = {
     "core.switching.generators": ("Streams", "reseed_generators"),
     "decision": ("Definition", "difference", "make_step"),
     "envs": (
-        "aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "turn_env",
+        "aec_env",
+        "generate_env",
+        "joint_env",
+        "parallel_env",
+        "single_env",
+        "turn_env",
         "vector_env",
     ),
     "errors": ("SimEnvError",),

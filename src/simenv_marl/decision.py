@@ -88,8 +88,9 @@ class Definition:
             names = [names]
         removed_by = dict(names if isinstance(names, Mapping) else dict.fromkeys(names))
         for name, agent in removed_by.items():
-            is_function = isinstance(name, str) or callable(name)
-            if not is_function or not (agent is None or callable(agent)):
+            if not (isinstance(name, str) or callable(name)) or not (
+                agent is None or callable(agent)
+            ):
                 raise DefinitionError(
                     "make_step: removed_by must be a dict from dotted names or functions to"
                     f" callables, not {short_repr(name)}: {short_repr(agent)}"
@@ -262,13 +263,11 @@ def _problems(definition: Definition) -> Iterator[str]:
     if not isinstance(space, spaces.Discrete):
         yield f"a dict as action_space_mapping needs a Discrete action_space, not {space}"
         return
-    actions = parts_of(space) or ()
-    absent = [action for action in actions if action not in decisions]
-    surplus = [action for action in decisions if action not in actions]
-    if absent or surplus:
+    differing = decisions.keys() ^ set(parts_of(space) or ())
+    if differing:
         yield (
-            f"the dict action_space_mapping must have just the actions of {space}; missing:"
-            f" {absent}, not in the space: {surplus}"
+            f"the dict action_space_mapping must have just the actions of {space}; these are in"
+            f" one of both only: {differing}"
         )
 
 
@@ -288,9 +287,8 @@ def _required_kind(
         return None if isinstance(part, Mapping) else "a callable or a dict"
     if name.endswith("_labels"):
         space = getattr(definition, name.removesuffix("_labels") + "_space")
-        if fit_labels(space, part):
-            return None
-        return f"texts for the parts of {short_repr(space)}, or a callable"
+        fits = texts_of(space, part) is not None
+        return None if fits else f"texts for the parts of {short_repr(space)}, or a callable"
     return "callable"
 
 
@@ -300,26 +298,28 @@ def parts_of(space: Space) -> Collection[int | str] | None:
         return range(int(space.start), int(space.start + space.n))
     if isinstance(space, spaces.Dict):
         return space.spaces
-    if space.shape is None or len(space.shape) != 1:
+    shape = space.shape or ()
+    return range(*shape) if len(shape) == 1 else None
+
+
+def texts_of(space: Space, labels: object, *, all_parts: bool = True) -> dict[Any, str] | None:
+    """Return labels as a dict from the parts of a space to texts. None if they do not fit it.
+
+    ``all_parts``: whether the parts of a ``Discrete`` must have labels, too.
+    """
+    parts = parts_of(space) or ()
+    if isinstance(parts, range) and isinstance(labels, Sequence) and not isinstance(labels, str):
+        labels = dict(zip(parts, labels, strict=False)) if len(labels) == len(parts) else None
+    if not isinstance(labels, Mapping):
         return None
-    return range(*space.shape)
-
-
-def fit_labels(space: Space, labels: object) -> bool:
-    """Return whether labels are texts for the parts of a space."""
-    parts = parts_of(space)
-    if parts is None or isinstance(labels, str):
-        return False
-    texts: Collection[object] = ()
-    if isinstance(labels, Mapping):
-        if labels.keys() == set(parts):
-            texts = labels.values()
-    elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
-        texts = labels
-    if len(texts) != len(parts) or not all(isinstance(text, str) for text in texts):
-        return False
-    # Labels distinguish the parts of arrays and dicts.
-    return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)
+    texts: Collection[str] = [text for text in labels.values() if isinstance(text, str)]
+    least = len(parts)
+    if not isinstance(space, spaces.Discrete):
+        texts = set(texts)  # they distinguish the parts of arrays and dicts
+    elif not all_parts:
+        least = 0
+    fits = least <= len(labels) == len(texts) and labels.keys() <= set(parts)
+    return dict(labels) if fits else None
 
 
 def _decisions(mapping: object) -> Mapping[Any, Any] | None:

@@ -33,7 +33,7 @@ from .hooks.handlers import (
     Installation,
     recorder,
 )
-from .hooks.hook import Hook, hook_of, hooks, rebind
+from .hooks.hook import Hook, hook_of, hooks
 from .hooks.places import (
     decorate,
     find_hook,
@@ -159,7 +159,7 @@ def _expose_function(function: Any) -> Any:
     hook.make_permanent(None, exposed=True)  # it is decorated or exposed already
     if isinstance(function, (staticmethod, classmethod)):
         return function
-    return rebind(wrapper, binding)
+    return binding(wrapper)
 
 
 def _find_target(target: Any) -> Hook:

@@ -16,7 +16,7 @@ from .core import Points, ViewOptions
 from .envs import SimulationVectorEnv, vector_env, view_class
 from .envs.single import plan_of
 from .errors import OptionValueError, UnknownPointError, short_repr
-from .simulation import Model, is_integer
+from .simulation import Model, check_count
 
 _RECIPES: Final[dict[str, tuple[Model, Points, ViewOptions]]] = {}
 """The registered simulations with their points and options, by name and version."""
@@ -59,8 +59,7 @@ def register_simulation(
         raise OptionValueError(
             f"name= must consist of letters, digits, _ and -, not {short_repr(name)}"
         )
-    if not is_integer(version) or version < 0:
-        raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
+    check_count(version, "version")
     plan = plan_of(simulation, points, options)
     recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options
@@ -103,17 +102,11 @@ def _titles(points: list[str]) -> list[str]:
     another point has the same title.
     """
     names = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
-    styles = [[_camel(name, parts) for name in names] for parts in (1, 2)]
-    styles.append(names)
-    titles: list[str] = []
-    for candidates in zip(*styles, strict=True):
-        unique = (
-            title
-            for title, style in zip(candidates, styles, strict=True)
-            if [*style, "Joint"].count(title) == 1
-        )
-        titles.append(next(unique))
-    return titles
+    styles = [*([_camel(name, parts) for name in names] for parts in (1, 2)), names]
+    return [
+        next(style[place] for style in styles if [*style, "Joint"].count(style[place]) == 1)
+        for place in range(len(names))
+    ]
 
 
 def _camel(name: str, parts: int) -> str:
@@ -139,11 +132,10 @@ def make_view(
     """
     simulation, points, options = _recall(recipe, module, view, options)
     mode = options.pop("render_mode", None)
-    plan = plan_of(simulation, points, {**options, "render_mode": None})
+    plan = plan_of(simulation, points, options)
     modes = plan.subject.render_modes
-    in_window = mode == "human" and mode not in modes and "rgb_array" in modes
-    if view not in ("single", "joint"):
-        in_window = False
+    is_shown = mode == "human" and mode not in modes and "rgb_array" in modes
+    in_window = is_shown and view in ("single", "joint")
     env = view_class(plan, view)(plan.amended({"render_mode": "rgb_array" if in_window else mode}))
     return HumanRendering(env) if in_window else env
 

@@ -20,7 +20,7 @@ from .envs.single import plan_of
 from .errors import OptionValueError, close_after, short_repr
 from .many.batch import BatchRun, policy_keys
 from .many.parallel import ProgressBar, import_extra, progress_bar, spread
-from .simulation import Model, is_integer
+from .simulation import Model, check_count
 
 
 def simulate(
@@ -216,14 +216,9 @@ def check_options(
         raise OptionValueError(
             f"collect must be a callable of a simulation, or None, not {short_repr(collect)}"
         )
-    positive = "a positive integer"
-    for name, value, least, expected in (
-        ("batch_size", batch_size, 1, positive),
-        ("concurrency", concurrency, 1, positive),
-        ("workers", workers, -1, "a non-negative integer, or -1 for as many as joblib has"),
-    ):
-        if not is_integer(value) or value < least:
-            raise OptionValueError(f"{name} must be {expected}, not {short_repr(value)}")
+    check_count(batch_size, "batch_size", 1)
+    check_count(concurrency, "concurrency", 1)
+    check_count(workers, "workers", -1)  # -1: as many as joblib has
     if workers:
         backend, _ = import_extra("joblib.parallel", f"workers={workers}").get_active_backend()
         if type(backend).__name__ == "MultiprocessingBackend":

@@ -49,9 +49,10 @@ def compared(aec: Any, turn: Any, seed: int, action_of: Any) -> None:
         answer = action_of(seen, told)
         aec.step(answer)
         booked = sum(aec.rewards.values())
-        while aec.agents and aec.terminations[aec.agent_selection] | aec.truncations[
-            aec.agent_selection
-        ]:
+        while (
+            aec.agents
+            and aec.terminations[aec.agent_selection] | aec.truncations[aec.agent_selection]
+        ):
             terminated, truncated = (
                 aec.terminations[aec.agent_selection],
                 aec.truncations[aec.agent_selection],
@@ -210,9 +211,7 @@ def test_numbers_beside_boxes_are_chosen_by_preference():
         action_mask_mapping=lambda: mask,
         rule_action_mapping={"rule": 2},
     )
-    bee = decision(
-        lambda: [2.0], agent="bee_0", rule_action_mapping=np.float32, **vector(0, 4)
-    )
+    bee = decision(lambda: [2.0], agent="bee_0", rule_action_mapping=np.float32, **vector(0, 4))
     env = turn_env(calling(ant, bee, ant, ant), [ant, bee])
     assert env.action_space == spaces.Box(-1, 1, (4,), np.float32)
     _, info = env.reset()
@@ -267,13 +266,12 @@ def test_the_last_observation_is_that_of_the_agent_that_decided_last():
         env.step(1)
 
 
-def test_a_clone_goes_on_as_its_original_does(_driver):
+def test_a_clone_goes_on_as_its_original_does():
     design = yards.Design(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
     env = turn_env(lambda: yards.Yard(design), yards.POINTS, possible_agents=yards.ROSTER)
     env.reset(seed=5)
     env.step(2)
-    methods = ["fork", "replay"] if _driver == "greenlet" else ["replay"]
-    clones = [clone(env, method=method) for method in methods]
+    clones = [clone(env, method=method) for method in (None, "replay")]
     ended = False
     while not ended:
         observation, reward, terminated, truncated, info = env.step(RULE)
@@ -299,9 +297,7 @@ def test_it_passes_the_check_of_gymnasium_and_stands_in_vectors(flatten):
     options = {"flatten": flatten}
     check_env(turn_env(calling(ant, bee, ant), [ant, bee], **options), skip_render_check=True)
     kind = generate_env(calling(ant, bee, ant), [ant, bee], view="turn", **options)
-    vectors = vector_env(
-        calling(ant, bee, ant), [ant, bee], view="turn", num_envs=2, **options
-    )
+    vectors = vector_env(calling(ant, bee, ant), [ant, bee], view="turn", num_envs=2, **options)
     single = kind()
     assert vectors.single_observation_space == single.observation_space
     vectors.reset(seed=1)

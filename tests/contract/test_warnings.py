@@ -403,6 +403,30 @@ def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard) -> N
     assert len(heard("several objects decide at")) == 1
 
 
+@pytest.mark.parametrize("deciders", [{}, {"one": lambda _: 1}])
+def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard) -> None:
+    class Yard:
+        def allot(self):
+            return [0, 0, 0, 0]
+
+    def name(item, yard):
+        return names[item]
+
+    def play_all():
+        model = calling(lambda: yard.allot(), lambda: yard.allot())
+        points = {Yard.allot: define(split=lambda yard: ["a", "b", "c"], agent=name)}
+        play_in_turns(aec_env(model, points, policies=deciders), 1)
+
+    yard = Yard()
+    names = {"a": "one", "b": "two", "c": None}
+    play_all()
+    assert not heard("several objects decide at")
+    names["c"] = "one"
+    play_all()
+    (text,) = heard("several objects decide at")
+    assert "as one agent, 'one'" in text
+
+
 @pytest.mark.parametrize("key", [Worker.die, f"{__name__}.Worker.die"])
 @pytest.mark.parametrize("form", [lambda key: key, lambda key: [key], lambda key: {key: None}])
 def test_functions_that_end_agents_are_named_as_points_are(key, form, heard) -> None:

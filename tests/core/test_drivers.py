@@ -105,9 +105,7 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
 
 @DRIVERS
 @pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_while_a_simulation_moves_other_threads_run_rules_and_environments_of_their_own(
-    driver, inner
-):
+def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
     decide, other = decision(), decision(lambda: "its rule")
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
@@ -146,7 +144,7 @@ WAYS = {
 @DRIVERS
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driver, way, last):
+def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
     def work():
         roots.append(weakref.ref(greenlet.getcurrent()))
         decide()
@@ -202,9 +200,7 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
 
 @DRIVERS
 @pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
-def test_threads_that_are_older_than_the_episode_are_refused_also_while_it_is_suspended(
-    driver, how
-):
+def test_decisions_in_threads_older_than_the_episode_are_refused(driver, how):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)

@@ -92,7 +92,7 @@ NOTHING = (None, (None, None), 0)
 
 
 @DRIVERS
-def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver):
+def test_a_user_without_a_loop_keeps_generator_hooks_and_tracking(driver):
     def hook(generator):
         """What takes note of asynchronous generators."""
 
@@ -115,7 +115,7 @@ def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver):
 
 @DRIVERS
 @pytest.mark.parametrize("inside", [(), (1, 2, 3, 4, 5), (0, 1), (5,)])
-def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver, inside):
+def test_a_users_loop_keeps_its_generator_hooks_and_tracking(driver, inside):
     """The reset and five steps are made inside a loop of the user's, or outside all."""
 
     async def act(move):
@@ -193,7 +193,7 @@ def test_an_interrupt_between_steps_reaches_the_users_handler(driver):
     assert env.simulation.log == [0, 1, 2, 3]
 
 
-def test_an_interrupt_while_the_model_computes_is_its_loops():
+def test_an_interrupt_while_the_model_computes_reaches_its_loop():
     env = deciding("greenlet", interrupted=True)
     env.step(1)
     with pytest.raises(KeyboardInterrupt):
@@ -306,7 +306,7 @@ async def office(simulation, decide, cleanup):
 
 @DRIVERS
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, end):
+def test_a_loop_of_the_model_cancels_its_tasks_at_the_end(driver, end):
     decide, cleanup = decision(), []
     env = single_env(
         script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),

@@ -52,7 +52,7 @@ RULED = """
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @pytest.mark.parametrize("first", ["user", "model"])
 @pytest.mark.parametrize("where", ["main", "spawned"])
-def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(where, first, driver):
+def test_a_call_on_the_users_side_of_a_hub_runs_the_rule(where, first, driver):
     """Whichever of the two has used the hub first, and wherever the user steps."""
     if (where, first, driver) == ("main", "model", "greenlet"):
         return  # a hub that begins in a simulation belongs to it

@@ -117,7 +117,7 @@ def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
     assert drawn.isdisjoint([random.Random(7).random(), np.random.RandomState(7).random(), *plain])
 
 
-def test_global_generators_are_left_alone_and_where_there_are_no_others_it_says_what_to_do():
+def test_reseeding_needs_generators_other_than_the_global_ones():
     model = SimpleNamespace(
         random=random, draw=random.random, numpy=np.random.mtrand._rand, function=world
     )
@@ -210,7 +210,7 @@ NAMES = [
 ]
 
 
-def test_names_may_be_any_value_and_are_the_same_in_every_process():
+def test_named_streams_are_the_same_in_each_process():
     here = draws(Streams(3), *NAMES)
     assert len(set(here)) == len(here)
     code = "from tests.core.test_reseeding import *; print(draws(Streams(3), *NAMES))"

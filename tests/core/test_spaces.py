@@ -212,7 +212,7 @@ def test_actions_outside_the_space_are_illegal(space, actions):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("number", [1, 2, 40])
-def test_each_element_of_a_box_counts_and_bounds_are_legal_in_every_precision(number, dtype):
+def test_each_element_of_a_box_is_checked_and_bounds_are_legal(number, dtype):
     high = np.full(number, 0.1, dtype)
     check = action_check(spaces.Box(-high, high, dtype=dtype))
     for legal in (

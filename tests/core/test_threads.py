@@ -54,9 +54,7 @@ def older_threads():
 
 
 @pytest.mark.parametrize("place", farms.PLACES)
-def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(
-    place, older_threads
-):
+def test_a_simulation_has_one_thread_and_mappings_run_in_the_users(place, older_threads):
     env, farm = farms.farm_env(aec_env, place, driver="thread")
     (own,) = set(simulation_threads()) - set(older_threads)
     seen = set()
@@ -161,9 +159,7 @@ def interrupt():
 
 @needs_signals
 @pytest.mark.parametrize("stops", [True, False])
-def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_given_up(
-    stops, monkeypatch, older_threads
-):
+def test_an_interrupted_wait_ends_the_episode_and_its_simulation(stops, monkeypatch, older_threads):
     if not stops:
         monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log, decide = threading.Event(), [], decision()
@@ -200,7 +196,7 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_g
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
-def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(
+def test_a_simulation_that_does_not_unwind_is_given_up_with_a_warning(
     monkeypatch, how, older_threads
 ):
     monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)

@@ -45,7 +45,7 @@ def is_blank(env, agent, observation):
 
 @settings(deadline=None)
 @given(EVERYBODY)
-def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
+def test_padded_aec_selects_live_agents_only(world):
     design, seed, kind = world
     env = colony(design, kind, aec_env, padded=True)
     env.reset(seed=seed)
@@ -80,7 +80,7 @@ def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
 
 @settings(deadline=None)
 @given(EVERYBODY)
-def test_rounds_have_everybody_and_are_those_of_the_living(world):
+def test_padded_rounds_have_all_agents_and_the_bare_views_results(world):
     design, seed, kind = world
     env, bare = (colony(design, kind, parallel_env, padded=padded) for padded in (True, False))
     observations, infos = env.reset(seed=seed)
@@ -125,7 +125,7 @@ VIEWS = [(parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)]
 GENERATIONS = life("1 acts, 1 health 7, 1 leaves, 2 health 1, 2 acts, 2 acts")
 
 
-def test_the_removed_are_paid_at_once_and_blank_from_then_on():
+def test_padded_removed_agents_get_their_reward_then_blanks():
     env = pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES))
     observations, infos = env.reset(seed=0)
     assert observations["being_1"].tolist() == [1, 0]
@@ -218,7 +218,7 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
 
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_a_padded_state_has_blanks_for_removed_agents_and_a_padded_copy_needs_a_reset(view, action):
+def test_a_padded_state_has_blanks_and_a_padded_copy_needs_a_reset(view, action):
     env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations"))
     env.reset(seed=0)
     assert env.state()[:2].tolist() == [1, 0]

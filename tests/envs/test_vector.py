@@ -248,7 +248,7 @@ def test_one_illegal_action_in_a_joint_view_moves_no_sub_environment():
     envs.step(legal)
 
 
-def test_the_action_of_one_that_is_reset_is_not_looked_at():
+def test_the_action_of_a_reset_sub_environment_is_not_checked():
     envs = begun(vector_env(Counter, Counter.decide, num_envs=2, max_steps=2))
     envs.step([1, 1])
     *_, truncations, _ = envs.step([1, 1])
@@ -338,7 +338,7 @@ def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, cu
     assert not stacks(stacks_before)
 
 
-def test_an_error_in_a_reset_and_a_closed_sub_environment_have_all_be_reset():
+def test_a_failed_reset_or_a_closed_sub_environment_needs_a_full_reset():
     fragile = definition(observation_space_mapping=lambda self: [0, 1 // (self.seed - 66)])
     envs = vector_env(Counter, {POINT: fragile}, num_envs=2)
     with pytest.raises(ZeroDivisionError) as caught:
@@ -366,7 +366,7 @@ def test_sub_environments_are_closed_if_another_one_cannot_be_made():
 
 
 @pytest.mark.parametrize(("driver", "error"), [("greenlet", WrongThreadError), ("thread", None)])
-def test_another_thread_may_use_it_with_the_thread_driver_alone(driver, error):
+def test_another_thread_needs_the_thread_driver(driver, error):
     envs = begun(vector_env(Counter, Counter.decide, num_envs=2, driver=driver))
     with ThreadPoolExecutor(1) as other:
         for method in (lambda: envs.step([1, 1]), lambda: envs.reset(seed=0), envs.close):
@@ -447,7 +447,7 @@ def test_close_unwinds_all_and_only_once(processes):
     assert set(multiprocessing.active_children()) <= processes_before
 
 
-def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
+def test_an_error_of_one_simulation_lets_the_others_unwind():
     stacks_before = stacks()
 
     class Stubborn(Counter):

@@ -79,7 +79,7 @@ def goes_on(envs: Any, seed: int = 0) -> None:
 @pytest.mark.parametrize(
     ("kind", "context"), [("masked", "spawn"), ("box", FORK), ("image", FORK), ("goal", FORK)]
 )
-def test_gymnasiums_processes_of_single_views_tell_the_same(kind, context, mode):
+def test_async_vector_env_of_single_views_returns_the_same(kind, context, mode):
     model, decision = VARIETY[kind]
     makers = [partial(single_env, model, {POINT: decision}, driver=driver) for driver in DRIVERS]
     ours = vector_env(model, {POINT: decision}, num_envs=len(makers), autoreset_mode=mode)
@@ -93,7 +93,7 @@ def processes_of(envs: Any) -> list[int]:
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
-def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simulations():
+def test_workers_share_simulations_evenly_and_none_is_idle():
     for number, asked, sizes in ((5, 3, [1, 2, 2]), (2, 5, [1, 1])):
         there = processes_of(workers(Failing, num_envs=number, workers=asked))
         assert sorted(map(there.count, set(there))) == sizes
@@ -222,7 +222,7 @@ def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
     assert all(map(gone, there))
 
 
-def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
+def test_an_environment_closes_although_a_simulation_hangs(monkeypatch):
     monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Failing)
     envs.reset(seed=0, options={"unwinding": {0: partial(time.sleep, 60)}})
@@ -232,7 +232,7 @@ def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monk
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
-def test_an_interrupted_step_leaves_the_environment_in_step():
+def test_an_interrupted_step_leaves_the_workers_usable():
     home = os.getpid()
 
     def interrupt(*_: Any) -> None:

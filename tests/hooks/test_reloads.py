@@ -3,13 +3,15 @@
 import importlib
 import sys
 import types
+from functools import partial
 
 import pytest
 
 from simenv_marl import aec_env
 from simenv_marl.errors import NoDecisionError, PatchError
 from simenv_marl.hooks.hook import hook_of
-from tests.worlds.models import define, play
+from simenv_marl.plugins import expose_to_plugins
+from tests.worlds.models import calling, define, play
 
 HEAD = """
 from tests.worlds.models import define
@@ -113,6 +115,19 @@ def test_points_that_a_new_definition_lacks_are_registered_no_more(model, monkey
     exec("pick = define(agent='picker')(pick)", vars(model))
     decorated.append(model.pick)
     assert aec_env(model.Sim).possible_agents == ["picker"]
+
+
+def test_targets_that_are_no_functions_are_not_looked_up(model):
+    largest = expose_to_plugins(partial(max, 3))
+    calls = []
+    plugin = (lambda *args: calls.append(args), largest, "before")
+    env = aec_env(
+        calling(lambda: model.choose(), lambda: largest(2)),
+        {model.choose: define()},
+        plugins=[plugin],
+    )
+    assert log_of(env) == [3, 3]
+    assert calls == [(2,)]
 
 
 def test_a_decorator_from_outside_may_run_again(model):

@@ -82,7 +82,7 @@ def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parse
     fails(500), fails(503), fails(429, retry_after="0"), "<html>busy</html>",
     says(None, refusal="I would rather not"), says("  "), {"object": "something else"}, 2.0,
 ], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
-def test_what_may_pass_is_tried_again(answer):
+def test_temporary_failures_are_tried_again(answer):
     with endpoint([answer, OPEN]) as (address, requests):
         assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
     assert len(requests) == 6
@@ -94,7 +94,7 @@ def test_what_may_pass_is_tried_again(answer):
     (says(None, refusal="no"), "failed", LanguageModelError, "fake gave no answer"),
     (says("ajar"), "illegal", InvalidActionError, "'ajar' names no legal action"),
 ], ids=["500", "HTML", "refusal", "wrong"])  # fmt: skip
-def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer, kind, error, match):
+def test_a_lasting_failure_is_an_error_and_a_fallback_answers(answer, kind, error, match):
     with endpoint([answer]) as (address, requests):
         with pytest.raises(error, match=match):
             played(model(address, retries=1))

@@ -24,14 +24,16 @@ def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
 def test_sets_that_are_sorted_and_values_of_a_process_are_sound():
     report = checked(sets.Ordered)
     assert not report.of("error")
-    assert any("four hash seeds" in line for line in report.checked)
+    assert any("six hash seeds" in line for line in report.checked)
 
 
 def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
     lock = threading.Lock()
     report = checked(sets.Walk, reward_mapping=lambda walk: walk.place + lock.locked())
     assert report.ok
-    assert "runs with other hash seeds, because TypeError: cannot pickle" in str(report.checked)
+    assert "new processes with six hash seeds, because TypeError: cannot pickle" in str(
+        report.checked
+    )
 
 
 def test_a_script_without_a_main_guard_can_be_checked(tmp_path):

@@ -105,7 +105,7 @@ def test_a_sound_walk_is_clean():
     assert any("aec, parallel, single, joint" in line for line in report.checked)
 
 
-def test_points_of_all_kinds_are_clean_and_those_of_the_same_name_have_different_labels():
+def test_points_of_all_kinds_are_clean():
     design = worlds.Design(worlds.KINDS, tuple((number % 9, number % 3) for number in range(27)))
     functions = worlds.points_of(design)
     report = clean(check_simulation(lambda: worlds.World(design, functions), functions, episodes=4))
@@ -180,7 +180,7 @@ def seen_by(walk):
     return walk.observe()
 
 
-def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
+def test_a_given_fingerprint_alone_is_compared():
     clean(
         checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place)
     )
@@ -203,19 +203,33 @@ def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
 
 # -- what is wrong with models --------------------------------------------------------------------
 
+
+def table_of(rows):
+    """Return a decorator that adds models to rows, each with the one finding it must have."""
+
+    def found(severity, words, *told, changes=None, **options):
+        def add(model):
+            row = model, changes, options, severity, words, told
+            rows.append(pytest.param(*row, id=model.__name__))
+            return model
+
+        return add
+
+    return found
+
+
+def report_with(model, changes, options, severity, words, told):
+    """The report of a model, and its one finding with these words."""
+    report = checked(model, changes, **options)
+    seen = finding(report, words)
+    assert seen.severity == severity
+    text = " ".join(f"{seen.title} {seen.evidence} {seen.explanation}".split())
+    assert all(part in text for part in told), text
+    return report, seen
+
+
 FOUND = []
-
-
-def found(severity, words, *told, changes=None, **options):
-    """Add a model to the table with its expected finding; an error is its only finding."""
-
-    def add(model):
-        FOUND.append(
-            pytest.param(model, changes, options, severity, words, told, id=model.__name__)
-        )
-        return model
-
-    return add
+found = table_of(FOUND)
 
 
 def variant(name, **functions):
@@ -398,13 +412,9 @@ class Seeding(Global):
 
 
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
-def test_faults_and_oddities_of_models_are_found(model, changes, options, severity, words, told):
-    report = checked(model, changes, **options)
-    seen = finding(report, words)
-    assert seen.severity == severity
+def test_faults_of_models_are_found(model, changes, options, severity, words, told):
+    report, seen = report_with(model, changes, options, severity, words, told)
     assert report.of("error") == ((seen,) if severity == "error" else ()), str(report)
-    text = " ".join(f"{seen.evidence} {seen.explanation}".split())
-    assert all(part in text for part in told), text
 
 
 def test_statistics_are_those_of_the_episodes():
@@ -467,7 +477,7 @@ def test_errors_are_raised_as_assertions():
     assert "NOTE" not in str(caught.value)
 
 
-def test_a_check_prints_nothing_and_restores_generators_and_functions(capsys):
+def test_a_check_restores_generators_and_functions_in_silence(capsys):
     class Loud(Walk):
         def run(self):
             print("hello")
@@ -650,7 +660,7 @@ def doubled(walk, _result):
     [(Global, {"global_rng": True}), (Walk, {"plugins": [(doubled, Walk.choose, "after")]})],
     ids=["global generators of its own", "plugins"],
 )
-def test_the_plain_run_has_the_generators_and_plugins_of_the_environment(model, options):
+def test_a_plain_run_has_the_generators_and_plugins_of_environments(model, options):
     """Models that draw from everybody's are cured; what plugins change, they change on purpose."""
     report = clean(checked(model, **options))
     assert "plain runs against RULE" in report.checked[0]

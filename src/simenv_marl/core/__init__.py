@@ -86,8 +86,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
-    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast", "preferences", "same", "source_name",
-    "split_batch", "stack_masks", "stacker", "taken",
+    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast",
+    "preferences", "same", "source_name", "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",
     "is_seed", "preserve_generators", "reseed_generators",

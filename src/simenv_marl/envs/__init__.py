@@ -62,8 +62,8 @@ def generate_env(
     here.
 
     {arguments}
-        view: "aec", "parallel", "single", "joint" or "turn". None: single if one point with one agent is
-            active, or if ``agent=`` names one agent; else AEC.
+        view: "aec", "parallel", "single", "joint" or "turn". None: single if one point with one
+            agent is active, or if ``agent=`` names one agent; else AEC.
         {options}
     """
     plan = plan_of(simulation, points, options)

@@ -1,6 +1,5 @@
 """The AEC view: it selects agents in the order of the simulation's decisions."""
 
-from numpy import ndarray
 from pettingzoo import AECEnv
 
 from ..core import (
@@ -9,7 +8,6 @@ from ..core import (
     EpisodeState,
     Info,
     Observation,
-    duplicate,
 )
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
@@ -105,11 +103,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
         elif episode is None or episode.pending is None:
             raise self.session.refusal()
         elif observe:
-            observation = episode.pending.observation
-            if type(observation) is ndarray:  # spares it a call
-                observation = observation.copy()
-            else:
-                observation = duplicate(observation)
+            observation = episode.pending.hand_out()
         name = self.agent_selection
         return (
             observation,
@@ -127,9 +121,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
             ResetNeededError: There is no episode.
         """
         record = self.episode.agent(agent)
-        if record is None or record.observation is None:
-            return self._point_of(agent).blank()
-        return duplicate(record.observation)
+        return self._point_of(agent).blank() if record is None else record.hand_out()
 
     # -- attributes of PettingZoo -----------------------------------------------------------------
 

@@ -525,8 +525,13 @@ def _unpickled(parcel: bytes) -> View:
 
 
 class OneAgentView(View, gym.Env[Any, Any]):
-    """A view with one agent: a Gymnasium environment."""
+    """A view with one agent: a Gymnasium environment.
 
+    Attributes:
+        own_agent: The agent that decides, during an episode. The joint view has none.
+    """
+
+    own_agent: Agent
     _agent_name: str
     # Gymnasium's checks look here.
     _np_random = View.np_random
@@ -545,6 +550,14 @@ class OneAgentView(View, gym.Env[Any, Any]):
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Prepare for a new episode; return the results of its reset."""
         raise NotImplementedError
+
+    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
+        """Return how an episode has ended: whether terminated, whether truncated."""
+        return episode.terminated, episode.truncated
+
+    def _clear(self) -> None:
+        if hasattr(self, "own_agent"):
+            del self.own_agent  # because it holds arguments of the model
 
     def reset(
         self,

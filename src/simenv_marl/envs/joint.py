@@ -8,8 +8,10 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core import (
+    MASK,
     Action,
     ActionCode,
+    Agent,
     EpisodeState,
     Info,
     Observation,
@@ -66,15 +68,15 @@ class Joint:
 
     def actions(
         self,
-        episode: EpisodeState,
+        agents: Mapping[str, Agent | None],
         action: Action,
     ) -> dict[str, Action]:
-        """Return the actions of the live agents.
+        """Return the actions of live agents, given by name. None: it has not appeared yet.
 
         Raises:
             InvalidActionError: The action lacks one, or has another form.
         """
-        live = [name for name in self.roster if name in episode.agents]
+        live = [name for name in self.roster if name in agents]
         if action is RULE:
             return dict.fromkeys(live, RULE)
         if self._flatten:
@@ -85,7 +87,8 @@ class Joint:
                 )
             parts = {name: action[self._places[name]] for name in live}
             for name in self._codes.keys() & parts.keys():
-                mask = episode.agents[name].mask
+                agent = agents[name]
+                mask = None if agent is None else agent.mask
                 parts[name] = self._codes[name].decode(parts[name], mask)
             return parts
         if not isinstance(action, Mapping) or set(action) != set(self.roster):
@@ -101,24 +104,13 @@ class Joint:
 
         An agent that has ended keeps its last observation. The reward is the sum of all rewards.
         """
-        observations = {}
-        acted = {}
-        masks = {}
         used = () if episode.round is None else episode.round.acted
-        for name in self.roster:
-            agent = episode.agents.get(name) or episode.ended[name]
-            observation = agent.observation
-            if observation is None:
-                observations[name] = agent.point.blank()
-            else:
-                observations[name] = duplicate(observation)
-            acted[name] = name in used
-            if agent.mask is not None:
-                masks[name] = duplicate(agent.mask)
+        observation, info = self.see(
+            [episode.agents.get(name) or episode.ended[name] for name in self.roster]
+        )
         pending = episode.pending
-        info: Info = {"deciding": "" if pending is None else pending.name, "acted": acted}
-        if masks:
-            info["action_mask"] = masks
+        info["deciding"] = "" if pending is None else pending.name
+        info["acted"] = {name: name in used for name in self.roster}
         if episode.clock is not None:
             info |= episode.clock.read(before)
         reward = episode.earned
@@ -126,6 +118,19 @@ class Joint:
             reward = 0.0
             for agent in (*episode.just_ended, *episode.agents.values()):
                 reward += agent.reward
+        return observation, reward, episode.terminated, episode.truncated, info
+
+    def see(self, agents: Sequence[Agent | None]) -> tuple[Observation, Info]:
+        """Return the observation of the agents of the roster, and an info with their masks.
+
+        None in place of an agent that has not appeared.
+        """
+        observations = {}
+        masks = {}
+        for (name, point), agent in zip(self.roster.items(), agents, strict=True):
+            observations[name] = point.blank() if agent is None else agent.hand_out()
+            if agent is not None and agent.mask is not None:
+                masks[name] = duplicate(agent.mask)
         joined: Observation = observations
         if self._flatten:
             for name in self._flat_observations:
@@ -133,7 +138,7 @@ class Joint:
                 observations[name] = spaces.flatten(space, observations[name])
             parts = list(observations.values())
             joined = np.concatenate(parts).astype(self.observation_space.dtype)
-        return joined, reward, episode.terminated, episode.truncated, info
+        return joined, {MASK: masks} if masks else {}
 
 
 class SimulationJointEnv(OneAgentView):
@@ -211,7 +216,7 @@ class SimulationJointEnv(OneAgentView):
         episode = self.session.episode
         if episode is None or (self._lock and not self._lock.held):
             return self._step_in_lock(SimulationJointEnv.step, action)
-        episode.step(self.joint.actions(episode, action))
+        episode.step(self.joint.actions(episode.agents, action))
         if self._shows:
             self.show_step()
         return self.read(episode)
@@ -237,22 +242,15 @@ class SimulationJointEnv(OneAgentView):
     def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
         """Return the observations, rewards and infos of the latest step of several views."""
         results = [view.read(view.episode) for view in views]
-        return (
-            [observation for observation, *_ in results],
-            [reward for _, reward, *_ in results],
-            [info for *_, info in results],
-        )
-
-    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return how an episode has ended: whether terminated, whether truncated."""
-        return episode.terminated, episode.truncated
+        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
+        return observations, rewards, infos
 
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""
         episode = self.episode
         if episode.pending is None:
             return {}
-        actions = self.joint.actions(episode, action)
+        actions = self.joint.actions(episode.agents, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError(
                 "RULE is not an action in vector environments; use joint_env, or policies="
@@ -278,7 +276,7 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
     for space in parts:
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
-                "flatten=True needs Discrete and one-dimensional Box spaces, or actions that are all"
-                f" discrete, not {space}"
+                "flatten=True needs one-dimensional Box and Discrete spaces, or actions that are"
+                f" all discrete, not {space}"
             )
     return spaces.flatten_space(spaces.Tuple(parts))

@@ -56,8 +56,7 @@ def _pad(
             info = infos[name]
             padded_observations[name] = observations.get(name)
         else:
-            agent.clear_observation()
-            agent.take_observation()  # so that ``observe`` and ``state`` have blanks
+            agent.clear_observation(forget=True)  # ``observe`` and ``state`` have blanks then
             info = agent.info
             if view.in_rounds:
                 info = {**info, "deciding": False, "acted": name in acted}

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from numpy import ndarray
 from pettingzoo import ParallelEnv
 
 from ..core import (
@@ -11,7 +10,6 @@ from ..core import (
     EpisodeState,
     Info,
     Observation,
-    duplicate,
 )
 from ..simulation import Sentinel
 from .agents import AgentsView
@@ -114,13 +112,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         rewards = {}
         infos = {}
         for name, agent in agents.items():
-            observation = agent.observation
-            if observation is None:
-                observations[name] = agent.point.blank()
-            elif type(observation) is ndarray:  # spares it a call
-                observations[name] = observation.copy()
-            else:
-                observations[name] = duplicate(observation)
+            observations[name] = agent.hand_out()
             rewards[name] = agent.reward
             info = agent.info
             infos[name] = info

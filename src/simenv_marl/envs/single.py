@@ -12,12 +12,10 @@ from typing import Any, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
-from numpy import ndarray
 from numpy.typing import NDArray
 
 from ..core import (
     Action,
-    Agent,
     EpisodeState,
     Info,
     Model,
@@ -25,7 +23,6 @@ from ..core import (
     Plan,
     Points,
     Space,
-    duplicate,
     make_plan,
 )
 from ..errors import CopyError, ReentrancyError, ViewError
@@ -63,7 +60,6 @@ class SimulationEnv(OneAgentView):
         own_agent: The agent, during an episode.
     """
 
-    own_agent: Agent
     _own_options = ("agent",)
 
     def set_up(self) -> None:
@@ -120,11 +116,7 @@ class SimulationEnv(OneAgentView):
         name = self._agent_name
         agent = episode.agents.get(name) or episode.ended[name]
         self.own_agent = agent
-        return duplicate(agent.observation), agent.info
-
-    def _clear(self) -> None:
-        if hasattr(self, "own_agent"):
-            del self.own_agent  # because it holds arguments of the model
+        return agent.hand_out(), agent.info
 
     def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
@@ -145,9 +137,8 @@ class SimulationEnv(OneAgentView):
         terminated = truncated = False
         if episode.pending is None:
             terminated, truncated = self.read_end(episode)
-        seen = agent.observation  # a copy is returned, because users may change it
         return (
-            seen.copy() if type(seen) is ndarray else duplicate(seen),
+            agent.hand_out(),
             agent.reward,
             terminated,
             truncated,
@@ -159,7 +150,7 @@ class SimulationEnv(OneAgentView):
         """Return the observations, rewards and infos of the latest step of several views."""
         agents = [view.own_agent for view in views]
         return (
-            [agent.observation for agent in agents],
+            [agent.raw_observation for agent in agents],
             [agent.reward for agent in agents],
             [agent.info for agent in agents],
         )
@@ -168,7 +159,7 @@ class SimulationEnv(OneAgentView):
         """Return how an episode has ended for the agent: whether terminated, whether truncated."""
         if self.own_agent.ended:
             return True, False
-        return episode.terminated, episode.truncated
+        return super().read_end(episode)
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
-from numpy import ndarray
 
 from ..core import (
     MASK,
@@ -26,6 +25,7 @@ from ..core import (
     common_observations,
     duplicate,
 )
+from ..decision import DecisionPoint
 from ..errors import ViewError, short_repr
 from ..simulation import RULE
 from .base import OneAgentView, StepResult
@@ -50,6 +50,14 @@ class Seat(NamedTuple):
     open_mask: Mask | None
 
 
+class _Seats(dict[DecisionPoint, Seat]):
+    """The seats of a view, by decision point."""
+
+    def __missing__(self, hook: DecisionPoint) -> NoReturn:
+        known = ", ".join(each.name for each in self)
+        raise ViewError(f"{hook.name} is no decision point of this view, which has {known}")
+
+
 class Turn:
     """The agents of a plan, as one learner that decides for each of them in turn.
 
@@ -71,7 +79,7 @@ class Turn:
         hooks = [point.hook for point in plan.active]
         kinds = map(np.int64, range(len(hooks)))
         masks = [code.widen(None) for code in codes]
-        self._seats = dict(zip(hooks, map(Seat, kinds, encoders, codes, masks), strict=True))
+        self._seats = _Seats(zip(hooks, map(Seat, kinds, encoders, codes, masks), strict=True))
         self.has_masks = any(mask is not None for mask in masks)
         self.informs = any(each.rule_action_mapping is not None for each in definitions)
         parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
@@ -83,7 +91,7 @@ class Turn:
         self._common = common
         self.observation_space: Space = self._whole
         self._flatten = options.flatten
-        self._beginnings: dict[tuple[np.int64, str], Observation] = {}
+        self._beginnings: dict[tuple[np.int64, str], Any] = {}
         if options.flatten:
             self.observation_space = spaces.flatten_space(self._whole)
             if not isinstance(self.observation_space, spaces.Box):
@@ -99,40 +107,45 @@ class Turn:
     def observe(self, agent: Agent) -> Observation:
         """Return an agent's latest observation as one of the learner."""
         seat = self._seats[agent.point.hook]
-        encode = seat.encode
-        shared = agent.observation
-        if encode is None and type(shared) is ndarray:
-            shared = shared.copy()
-        else:
-            if shared is None:
-                shared = agent.point.blank()
-            shared = duplicate(shared) if encode is None else encode(shared)
+        shared: Any = agent.hand_out()
+        if seat.encode is not None:
+            shared = seat.encode(shared)
         if self._flatten:
             is_box = isinstance(self._common, spaces.Box)
-            flat = shared.ravel() if is_box else spaces.flatten(self._common, shared)
+            flat: Any = shared.ravel() if is_box else spaces.flatten(self._common, shared)
             return np.concatenate((self._beginning(agent, seat), flat))
         if self._indices:
             index = self._indices[agent.name]
             return {"agent": index, "kind": seat.kind, "observation": shared}
         return {"kind": seat.kind, "observation": shared}
 
+    def mask(self, agent: Agent) -> Mask | None:
+        """Return the mask of the learner's actions. None: nothing can be masked."""
+        return self.seat(agent).code.widen(agent.mask)
+
+    def decode(self, agent: Agent, action: Action) -> Action:
+        """Return an agent's own action for one of the learner."""
+        return self.seat(agent).code.decode(action, agent.mask)
+
     def add_mask(self, agent: Agent, info: Info) -> None:
         """Add the mask of the learner's actions to an agent's info."""
         if agent.mask is None:
             mask = self._seats[agent.point.hook].open_mask
             if mask is not None:
-                info[MASK] = mask.copy()
+                info[MASK] = duplicate(mask)
         elif self.translates:  # else the info has it
             info[MASK] = self._seats[agent.point.hook].code.widen(agent.mask)
 
-    def _beginning(self, agent: Agent, seat: Seat) -> Observation:
+    def _beginning(self, agent: Agent, seat: Seat) -> Any:
         """Return the flattened agent and kind, which come before the observation."""
         key = seat.kind, agent.name if self._indices else ""
         if key not in self._beginnings:
             numbers = {"kind": seat.kind}
             if self._indices:
                 numbers["agent"] = self._indices[agent.name]
-            parts = [spaces.flatten(self._whole[name], numbers[name]) for name in sorted(numbers)]
+            parts: list[Any] = [
+                spaces.flatten(self._whole[name], numbers[name]) for name in sorted(numbers)
+            ]
             self._beginnings[key] = np.concatenate(parts).astype(self.observation_space.dtype)
         return self._beginnings[key]
 
@@ -154,10 +167,8 @@ class SimulationTurnEnv(OneAgentView):
             bounds; for both, one whose first n parts are preferences for the actions of a
             ``Discrete`` (the largest legal one is taken).
         turn: The agents, united into one learner.
-        own_agent: The agent whose decision is pending, or was the last one.
     """
 
-    own_agent: Agent
     _own_options = ("flatten", "state_in_info")
     _agent_name = "turn"
     _last_time: float | None = None  # the time of the previous reset or step
@@ -187,10 +198,6 @@ class SimulationTurnEnv(OneAgentView):
             agent = next(agent for agent in agents if agent.decided)
         self.own_agent = agent
         return self.turn.observe(agent), self._info(episode, agent)
-
-    def _clear(self) -> None:
-        if hasattr(self, "own_agent"):
-            del self.own_agent  # because it holds arguments of the model
 
     def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
@@ -224,7 +231,7 @@ class SimulationTurnEnv(OneAgentView):
         agent = episode.pending
         if agent is None or action is RULE:
             return action
-        return self.turn.seat(agent).code.decode(action, agent.mask)
+        return self.turn.decode(agent, action)
 
     def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
         """Return the observation, the reward and the info of a step."""
@@ -280,10 +287,6 @@ class SimulationTurnEnv(OneAgentView):
             [info for _, _, info in results],
         )
 
-    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return how an episode has ended: whether terminated, whether truncated."""
-        return episode.terminated, episode.truncated
-
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""
         episode = self.episode
@@ -293,5 +296,5 @@ class SimulationTurnEnv(OneAgentView):
     def masks(self) -> list[Mask]:
         """Return the mask of the deciding agent."""
         agent = self.episode.pending or self.own_agent
-        mask = self.turn.seat(agent).code.widen(agent.mask)
+        mask = self.turn.mask(agent)
         return [agent.point.open_mask() if mask is None else mask]

@@ -22,7 +22,6 @@ from ..core import (
     Points,
     checked_seed,
     duplicate,
-    is_seed,
     stacker,
 )
 from ..decision import decision_points
@@ -37,7 +36,7 @@ from ..errors import (
     short_repr,
 )
 from ..many.parallel import WorkerPool
-from ..simulation import RULE
+from ..simulation import RULE, check_count
 from .base import OneAgentView, ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
@@ -110,8 +109,8 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             SimEnvError: An argument is invalid. The message says which.
         """
         super().__init__()
-        self.num_envs = _count(num_envs, "num_envs", 1)
-        workers = _count(workers, "workers", 0)
+        self.num_envs = check_count(num_envs, "num_envs", 1)
+        workers = check_count(workers, "workers")
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -435,12 +434,3 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
     def __reduce_ex__(self, protocol: object) -> NoReturn:
         """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
         raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make a new one")
-
-
-def _count(value: int, name: str, least: int) -> int:
-    """Return an option that is an integer of at least ``least``."""
-    if not is_seed(value) or value < least:
-        raise OptionValueError(
-            f"{name} must be an integer of at least {least}, not {short_repr(value)}"
-        )
-    return int(value)

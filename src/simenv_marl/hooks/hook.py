@@ -9,7 +9,7 @@ handlers around it; at the end it removes the entry.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Hashable, Set
 from functools import cached_property, partial, update_wrapper
 from inspect import (
     Parameter,
@@ -82,33 +82,29 @@ _RULE_DECIDES: Final = "not INTERCEPTORS or getcurrent() in INTERCEPTORS.roots"
 _INTERCEPT: Final = "(INTERCEPTORS.get(getcurrent()) or intercept)"
 
 
-def _source(hook: Hook, reserved: Collection[str]) -> str:
+def _source(hook: Hook, reserved: Set[str]) -> str:
     """Return the source code of a hook's wrappers, which uses the reserved names.
 
     It determines the cost of a call without interceptors: two plain calls if no call can be
     incomplete, else three.
     """
-    parameters = [] if hook.signature is None else list(hook.signature.parameters.values())
+    signature = hook.signature
+    parameters = [] if signature is None else list(signature.parameters.values())
     positional = [p for p in parameters if p.kind in POSITIONAL]
     required = [p.name for p in positional if p.default is p.empty]
-    named_only = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
+    others = [p for p in parameters if p.kind is p.VAR_POSITIONAL or p.kind is p.KEYWORD_ONLY]
     names = [f"_{number}" for number in range(len(positional))]
-    only_self = hook.bound and len(parameters) == len(required) == 1
-    nothing = hook.signature is not None and not parameters
     is_incomplete = "True"
     may_not_fit = "True"
     declaration = "*args, **kwargs"
     arguments = "args"
-    if nothing or (only_self and required[0] not in reserved):
+    only_self = signature is not None and len(parameters) == len(required) == int(hook.bound)
+    if only_self and reserved.isdisjoint(required):
         is_incomplete = ""
         # A staticmethod that looks like a method may receive its argument by keyword.
         names = required
         declaration = ", ".join(names)
-    elif (
-        positional
-        and all(p.kind is not p.VAR_POSITIONAL for p in parameters)
-        and all(p.default is not p.empty for p in named_only)
-    ):
+    elif positional and all(p.default is not p.empty for p in others):
         is_incomplete = f"kwargs or {names[-1]} is ABSENT"
         may_not_fit = f"kwargs or len(args) < {len(required)}"
         declaration = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
@@ -130,7 +126,7 @@ def _source(hook: Hook, reserved: Collection[str]) -> str:
     return f"""{source}
     if {_RULE_DECIDES}:
         {result(f"rule({values})")}
-    {result(f"{_INTERCEPT}(({values}), {'{}' if named_only else 'BOUND'})")}
+    {result(f"{_INTERCEPT}(({values}), {'{}' if others else 'BOUND'})")}
 """
 
 
@@ -143,40 +139,32 @@ class _Code(str):
         return str(self)
 
 
+_PLACED: Final = ("{}, ", "{}, ", "*{}, ", "", "")
+"""The source of a bound parameter among the positional arguments, by its kind."""
+
+_NAMED: Final = ("", "", "", "{0!r}: {0}, ", "**{}, ")
+"""The same among the keyword arguments."""
+
+
 def _make_binder(signature: Signature | None) -> Callable[..., Bound]:
     """Make a function that returns its arguments: by position where possible, with defaults."""
     if signature is None:
         return lambda *args, **kwargs: (args, kwargs)
-    parameters: list[Parameter] = []
-    args = ""
-    kwargs = ""
+    own: list[Parameter] = []
     for name, p in signature.parameters.items():
-        default = p.empty if p.default is p.empty else _Code(f"defaults[{name!r}]")
-        parameters.append(Parameter(name, p.kind, default=default))
-        if p.kind in POSITIONAL:
-            args += f"{name}, "
-        elif p.kind is p.VAR_POSITIONAL:
-            args += f"*{name}, "
-        elif p.kind is p.KEYWORD_ONLY:
-            kwargs += f"{name!r}: {name}, "
-        else:
-            kwargs += f"**{name}, "
-    scope: dict[str, Any] = {
-        "defaults": {name: p.default for name, p in signature.parameters.items()},
-    }
-    exec(f"def bind{Signature(parameters)}: return ({args}), {{{kwargs}}}", scope)
+        default = p.empty if p.default is p.empty else _Code(f"parameters[{name!r}].default")
+        own.append(Parameter(name, p.kind, default=default))
+    args = "".join(_PLACED[p.kind].format(p.name) for p in own)
+    kwargs = "".join(_NAMED[p.kind].format(p.name) for p in own)
+    scope: dict[str, Any] = {"parameters": signature.parameters}
+    exec(f"def bind{Signature(own)}: return ({args}), {{{kwargs}}}", scope)
     bind: Callable[..., Bound] = scope["bind"]
     return bind
 
 
-def unbind(value: object) -> object:
-    """Return an attribute of a class or module without its binding."""
-    return value.__func__ if isinstance(value, (staticmethod, classmethod)) else value
-
-
-def rebind(wrapper: FunctionType, binding: Binding | None) -> Model:
-    """Return a wrapper with a binding; None for a plain function."""
-    return wrapper if binding is None else binding(wrapper)
+def unbind(value: Model) -> Model:
+    """Return an attribute of a class or module, or a method, without its binding."""
+    return getattr(value, "__func__", value)
 
 
 def hook_of(value: object) -> Hook | None:
@@ -196,9 +184,8 @@ def made_with(wrapper: object) -> Any:
 
 def unwrap(function: object) -> Model:
     """Return the function behind a wrapper; any other function itself, unbound."""
-    function = getattr(function, "__func__", function)
     hook = hook_of(function)
-    return function if hook is None else hook.function
+    return unbind(function) if hook is None else hook.function
 
 
 # -- hooks ----------------------------------------------------------------------------------------
@@ -338,7 +325,7 @@ class Hook:
             "intercept": self._intercept,
             "rule": self.function,
         }
-        exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
+        exec(compile(_source(self, scope.keys()), f"<wrapper of {self.name}>", "exec"), scope)
         wrapper: FunctionType = scope.pop("wrapper")
         update_wrapper(wrapper, self.function)
         vars(wrapper)[_MADE_WITH] = made_with

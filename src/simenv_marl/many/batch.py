@@ -29,6 +29,7 @@ from ..core import (
     AskingPolicy,
     DeferredPolicy,
     Episode,
+    EpisodePolicy,
     Info,
     Plan,
     Point,
@@ -69,7 +70,8 @@ class BatchPolicy:
         self.keys: list[object] = []
         self.policy: Callable[..., Action] = two_arguments(policy)
         self.takes_identities = self.policy is policy and takes_identities(policy)
-        self.alone = alone or isinstance(self.policy, AskingPolicy)
+        is_asked = isinstance(self.policy, EpisodePolicy) and not self.policy.batched
+        self.alone = alone or is_asked
         self._groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
@@ -118,6 +120,8 @@ class PolicyKey(DeferredPolicy):
     def __init__(self, place: int, batch_policy: BatchPolicy) -> None:
         self.place = place
         self.batch_policy = batch_policy
+        policy = batch_policy.policy
+        self.looks_back = isinstance(policy, EpisodePolicy) and policy.looks_back
 
     def answer(
         self,
@@ -128,7 +132,10 @@ class PolicyKey(DeferredPolicy):
     ) -> Action:
         """Answer one decision at once."""
         if self.batch_policy.alone:
-            return self.batch_policy.policy(observation, info)
+            policy = self.batch_policy.policy
+            if isinstance(policy, EpisodePolicy):
+                return policy.respond(episode, agent, observation, info)
+            return policy(observation, info)
         group = self.batch_policy.group(agent.point)
         actions, _ = group.ask([episode], [observation], [info])
         return actions[0]
@@ -207,8 +214,12 @@ class Group:
             identities = [(episode.seed, episode.turns) for episode in episodes]
         number = len(episodes)
         try:
-            stack = self.stack(observations)
-            answers = policy.answers(stack, infos, identities)
+            if isinstance(policy.policy, EpisodePolicy):
+                agents = [episode.deciding for episode in episodes]
+                answers = policy.policy.respond_to_many(agents, infos)
+            else:
+                stack = self.stack(observations)
+                answers = policy.answers(stack, infos, identities)
             return read_answers(answers, policy, number)
         except BaseException as error:
             noun = "seed" if number == 1 else "seeds"
@@ -377,10 +388,10 @@ class BatchRun:
             agent, key = _pending(episode)
             if not key.batch_policy.alone:
                 group = key.batch_policy.group(agent.point)
-                group.waiting.append((place, episode, agent.observation, agent.take_info()))
+                group.waiting.append((place, episode, agent.raw_observation, agent.take_info()))
                 self._groups[group] = None
                 return
-            arguments = episode, agent, duplicate(agent.observation), agent.take_info()
+            arguments = episode, agent, duplicate(agent.raw_observation), agent.take_info()
             if isinstance(key, AskingKey) and key.waits:
                 self._crowd = min(self.size, max(self._crowd, self.concurrency))
                 self._backlog.append((place, episode, partial(key.begin, *arguments)))
@@ -419,7 +430,7 @@ class BatchRun:
             arrays = {name: np.asarray(value)[None] for name, value in extras.items()}
             group = key.batch_policy.group(agent.point)
             answers = [action], arrays
-            self.watcher.record(group, [place], [episode], [agent.observation], answers)
+            self.watcher.record(group, [place], [episode], [agent.raw_observation], answers)
         episode.step(action)
 
     def _end(self, place: int, episode: Episode) -> None:

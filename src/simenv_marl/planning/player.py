@@ -26,7 +26,6 @@ from ..core import (
     Where,
     action_check,
     checked_actions,
-    duplicate,
     is_planner,
     pending_view,
     policy_for,
@@ -216,17 +215,17 @@ class Player:
         if name in self.latest:
             return self.latest[name]
         agent = self.episode.agents.get(name, self.agent)
-        if agent.observation is None:
-            return agent.point.blank(), agent.info
-        return duplicate(agent.observation), agent.info
+        return agent.hand_out(), agent.info
 
     # -- through wrappers -------------------------------------------------------------------------
 
     def _space_of(self, name: str) -> Space:
-        """Return the action space of an agent in the wrapped environment."""
+        """Return the action space of an agent, or of all together, in the wrapped environment."""
         space: Any = self.env.action_space
         if callable(space):
             space = space(name)
+        elif name != self.name:
+            space = space[name]
         return space  # type: ignore[no-any-return]
 
     def _step_env(
@@ -314,19 +313,13 @@ class JointPlayer(Player):
                 " agents"
             )
 
-    def _space_of(self, name: str) -> Space:
-        space: Any = self.env.action_space
-        if name != self.name:
-            space = space[name]
-        return space  # type: ignore[no-any-return]
-
     def _check(
         self,
         action: Action,
         mask: Mask | None,
     ) -> None:
         if self._space_of(self.name) == self.view.action_space:
-            checked_actions(self.episode, self.view.joint.actions(self.episode, action))
+            checked_actions(self.episode, self.view.joint.actions(self.episode.agents, action))
         elif action is not RULE:
             samples = self._samples(action, self.name)
             if samples:

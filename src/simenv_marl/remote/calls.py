@@ -130,7 +130,7 @@ class RemoteEpisode:
         """Begin an episode in a process with a line, and read its frames up to the first call.
 
         The process decides itself at points other than these. The frames before the first call may
-        have no time, but whoever asks after the reset must learn whether there is one.
+        have no time, but code that asks after the reset must learn whether there is one.
         """
         self._child = child
         self._points = points

@@ -3,10 +3,9 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import zip_longest
-from math import inf
 from subprocess import DEVNULL, TimeoutExpired, run
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -20,6 +19,7 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
+from ..simulation import check_count, check_seconds
 from .child import MOST_FRAMES, Child
 from .wire import KEYS, Frame, Json, decode, encode
 
@@ -112,26 +112,24 @@ def check_wire(
         raise OptionValueError(
             f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}"
         )
-    if decisions < 1 or not 0 < timeout < inf:
-        raise OptionValueError(
-            f"decisions and timeout must be positive, not {decisions} and {timeout}"
-        )
+    check_count(decisions, "decisions", 1)
+    check_seconds(timeout, "timeout")
     start = encode({"start": {"seed": seed, "options": options or {}}})
     return _Check(command, start, decisions, timeout).run()
 
 
+@dataclass
 class _Check:
     """A check of one simulator. Its tests raise a ``ProcessError`` if they fail."""
 
-    def __init__(self, command: Sequence[str], start: bytes, longest: int, timeout: float) -> None:
-        self._command = command
-        self._start = start
-        self._longest = longest
-        self._timeout = timeout
-        self._first: Frames = []  # an episode by the rule, in a new process
-        self._calls: Frames = []  # its "decide" frames
-        self._can: frozenset[str] = frozenset()
-        self._draws = False  # whether other random numbers are known to change an episode
+    _command: Sequence[str]
+    _start: bytes
+    _longest: int
+    _timeout: float
+    _first: Frames = field(default_factory=list)  # an episode by the rule, in a new process
+    _calls: Frames = field(default_factory=list)  # its "decide" frames
+    _can: frozenset[str] = frozenset()
+    _draws: bool = False  # whether other random numbers are known to change an episode
 
     def run(self) -> WireReport:
         """Run all tests; if a simulator fails one of the first two, only these."""

@@ -4,9 +4,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from math import inf
-
-import numpy as np
 
 from ..core import acquire, release
 from ..decision import Definition
@@ -20,7 +17,7 @@ from ..errors import (
     UnknownPointError,
     short_repr,
 )
-from ..simulation import TRUNCATED, Model, SimulationInterface
+from ..simulation import TRUNCATED, Model, SimulationInterface, check_seconds
 from .calls import DecisionFunction, RemoteCall, RemoteEpisode, decision_function
 from .child import Child, StrPath
 from .wire import encode
@@ -77,14 +74,6 @@ class ProcessSimulation(SimulationInterface):
                 "ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors"
             )
         self.command = _command_words(command)
-        if (
-            isinstance(timeout, bool)
-            or not isinstance(timeout, (int, float, np.number))
-            or not 0 < timeout < inf
-        ):
-            raise OptionValueError(
-                f"timeout must be a positive number of seconds, not {short_repr(timeout)}"
-            )
         if env is not None and not (
             isinstance(env, Mapping)
             and all(isinstance(text, str) for text in [*env, *env.values()])
@@ -94,7 +83,7 @@ class ProcessSimulation(SimulationInterface):
             )
         if cwd is not None and not isinstance(cwd, (str, os.PathLike)):
             raise OptionValueError(f"cwd must be the path of a folder, not {short_repr(cwd)}")
-        self.timeout = float(timeout)
+        self.timeout = check_seconds(timeout, "timeout")
         self.env = None if env is None else dict(env)
         self.cwd = cwd
         self._points = _checked_points(points)

@@ -21,10 +21,9 @@ from ..errors import (
     short_repr,
 )
 from ..many.parallel import import_extra
-from ..simulation import Action, Observation
+from ..simulation import Action, Observation, check_count
 from . import descriptions
 from .descriptions import Schema, action_schema, at_decision, parse
-from .policies import check_count
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""
@@ -85,8 +84,6 @@ class LanguageModelPolicy:
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        check_count("history", history)
-        check_count("retries", retries)
         if describe is not None and not callable(describe):
             raise OptionValueError(
                 f"describe must be a callable of a Decision, or None, not {short_repr(describe)}"
@@ -100,8 +97,8 @@ class LanguageModelPolicy:
         }
         self._instructions = instructions
         self._describe = describe or descriptions.describe
-        self._history_length = history
-        self._retries = retries
+        self._history_length = check_count(history, "history")
+        self._retries = check_count(retries, "retries")
         self._request = {"timeout": timeout, **request}
         self._client = client
         self._own_client: Any = None

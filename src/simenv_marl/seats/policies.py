@@ -21,7 +21,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
-from ..simulation import RULE, Action, Observation, Sentinel
+from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
 from .descriptions import to_action
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
@@ -29,12 +29,6 @@ KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 
 Policy = Callable[..., Action | Awaitable[Action]]
 """A policy, as ``simulate`` takes them. It may be a coroutine function."""
-
-
-def check_count(name: str, value: object) -> None:
-    """Check that an argument is a non-negative integer, or raise an ``OptionValueError``."""
-    if type(value) is not int or value < 0:
-        raise OptionValueError(f"{name} must be a non-negative integer, not {short_repr(value)}")
 
 
 class FallbackPolicy(PolicyWrapper):
@@ -74,14 +68,9 @@ class FallbackPolicy(PolicyWrapper):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
         self._ask_fallback = Caller(fallback if callable(fallback) else _leave_to_rule)
         super().__init__(policy, asks=("_decision", *self._ask_fallback.names))
-        if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
-            raise OptionValueError(
-                f"timeout must be a number of seconds or None, not {short_repr(timeout)}"
-            )
-        check_count("retries", retries)
         self.fallback = fallback
-        self.timeout = timeout
-        self.retries = retries
+        self.timeout = None if timeout is None else check_seconds(timeout, "timeout")
+        self.retries = check_count(retries, "retries")
         self.waits = self.waits or waits(fallback)
         self.last_error: str | None = None
         self._token = uuid4().hex

@@ -10,7 +10,6 @@ calls. Both are also on the command line::
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -20,7 +19,7 @@ from ..core import CheckOptions, Point, Points, is_seed
 from ..envs import VIEWS
 from ..envs.single import plan_of
 from ..errors import OptionValueError, short_repr
-from ..simulation import Model
+from ..simulation import Model, check_count, check_seconds
 from .checks import Check
 from .report import (
     CheckReport,
@@ -31,6 +30,7 @@ from .report import (
     order_of,
 )
 from .runs import (
+    WARNINGS,
     Run,
     Runner,
     describe_with_place,
@@ -93,25 +93,23 @@ def check_simulation(
         raise OptionValueError(
             f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}"
         )
-    for name, number in (("episodes", episodes), ("max_steps", max_steps)):
-        if not is_seed(number) or number == 0:
-            raise OptionValueError(f"{name} must be a positive integer, not {short_repr(number)}")
-    if not 0 < time_limit < math.inf:
-        raise OptionValueError(
-            f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
-        )
+    check_count(episodes, "episodes", 1)
+    check_count(max_steps, "max_steps", 1)
+    check_seconds(time_limit, "time_limit")
     check = Check(
-        make_plan=partial(plan_of, simulation, points, options),
-        max_steps=max_steps,
-        seconds=time_limit / 4,
-        state_of=fingerprint,
-        seeds=list(map(int, unique_seeds)),
-        most_episodes=episodes,
+        partial(plan_of, simulation, points, options),
+        max_steps,
+        time_limit / 4,
+        fingerprint,
+        list(map(int, unique_seeds)),
+        episodes,
     )
     with silence() as warnings:
         check.run()
-    for warning in warnings:
-        check.add("warned", str(warning.message)[:300])
+    for text in (str(warning.message) for warning in warnings):
+        for part, name in WARNINGS.items():
+            if part in text:
+                check.add(name, text[:400], kind=part)
     return check.report(getattr(simulation, "__name__", type(simulation).__name__))
 
 
@@ -148,12 +146,12 @@ def inspect_simulation(
         run = runner.run_plainly(seed)
         refused = runner.refused_views()
     return Inspection(
-        simulation=runner.plan.name,
-        points=tuple(map(_describe, runner.plan.active)),
-        views=tuple(view for view in VIEWS if view not in refused),
-        calls=order_of(run.calls),
-        counts=dict(Counter(run.calls)),
-        ended=f"{len(run.calls)} decisions, then {_describe_end(run)}",
+        runner.plan.name,
+        tuple(map(_describe, runner.plan.active)),
+        tuple(view for view in VIEWS if view not in refused),
+        order_of(run.calls),
+        dict(Counter(run.calls)),
+        f"{len(run.calls)} decisions, then {_describe_end(run)}",
     )
 
 

@@ -153,8 +153,11 @@ def differences(
         common = one.keys() & other.keys()
         paths = [path for path in paths if path in common or path.startswith(STEP)]
     parts = [Difference(path, one.get(path, ABSENT), other.get(path, ABSENT)) for path in paths]
-    different = [part for part in parts if _key(part.first) != _key(part.second)]
-    return [part for part in different if generalize(part.path) not in ignored]
+    return [
+        part
+        for part in parts
+        if _key(part.first) != _key(part.second) and generalize(part.path) not in ignored
+    ]
 
 
 def _key(value: Model) -> tuple[Model, ...]:

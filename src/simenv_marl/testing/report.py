@@ -63,8 +63,8 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
     ),
     "silent_override": (
         "error",
-        "{kind} overrides a decision point, and its objects are no agents",
-        """The model calls the overriding function, which is no decision point: its own code
+        "Functions override a decision point, and their objects are no agents",
+        """The model calls an overriding function, which is no decision point: its own code
         decides, and no environment is asked. Decorate it with make_step, or add it to points,
         too. If the subclass only extends the function, call super() in it. If its objects
         should not be agents, give their function another name.""",
@@ -208,7 +208,7 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
     ),
     "warned": (
         "warning",
-        "An environment warns",
+        "An environment warns: {kind}",
         """The simulation may refuse to end (an except that catches everything), several objects
         may decide as one agent (see agent= of make_step), or agents that the options name do
         not exist.""",

@@ -23,10 +23,9 @@ from collections.abc import (
     Iterator,
 )
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
-from functools import cached_property, partial, wraps
-from itertools import islice
+from functools import cached_property
 from textwrap import shorten
 from types import FrameType, coroutine
 from typing import Any, Final, NoReturn
@@ -40,7 +39,6 @@ from ..core import (
     GlobalRandom,
     LoopExit,
     Plan,
-    Point,
     Where,
     environment_context,
     global_states,
@@ -63,9 +61,13 @@ from ..simulation import (
 )
 from .fingerprint import STEP, Fingerprint, fingerprint
 
-_WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
-"""Texts of the warnings that are findings."""
-
+WARNINGS: Final = {
+    "their own rule decides": "silent_override",
+    "refuses to end": "warned",
+    "several objects decide at": "warned",
+    "did not appear in the episode": "warned",
+}
+"""Texts of the warnings that are findings, with their names."""
 
 Rule = Generator[Model, Model, Model]
 """The rule of a generator or coroutine function, while it runs."""
@@ -150,7 +152,7 @@ def silence() -> Iterator[list[warnings.WarningMessage]]:
         redirect_stderr(output),
     ):
         warnings.simplefilter("ignore")
-        for pattern in _WARNINGS:
+        for pattern in WARNINGS:
             warnings.filterwarnings("always", f".*{pattern}")
         yield records
 
@@ -166,16 +168,17 @@ class Run:
         calls: The name of the decision point, or of the agent, of each step.
         parts: The fingerprint of the steps (the decisions of the rules, or the results of
             ``last()``), and of the simulation at the end or at the limit of decisions.
-        results: The agents and results of ``last()`` in an episode of random actions.
+        results: The agents in an episode of random actions, the numbers of their earlier decisions,
+            and the results of ``last()``.
         actions: Those actions.
         in_main_loop: Whether a plain run is in the main loop of the simulation.
         is_cut: Whether the run has reached the limit of decisions.
         end: "terminated" or "truncated".
         error: The exception that ended the run, unless the limit of decisions did.
-        is_stuck: Whether the last step began long before that exception.
+        step_began: The time at which the last step began.
         draws: The global generators that the run has used, by name.
         early: The places where a plain run called decision points before its main loop, by name.
-        times: The times of the simulation at the decisions of an episode, if it has a clock.
+        times: The times of the simulation at its steps, if it has a clock.
     """
 
     def __init__(self, state_of: Callable[[Model], Model] | None = None) -> None:
@@ -189,17 +192,16 @@ class Run:
         self.simulation: Model = None
         self.calls: list[str] = []
         self.parts: Fingerprint = {}
-        self.results: list[tuple[Agent, StepResult]] = []
+        self.results: list[tuple[Agent, int, StepResult]] = []
         self.actions: list[Action] = []
         self.in_main_loop = False
         self.is_cut = False
         self.end = "terminated"
         self.error: BaseException | None = None
-        self.is_stuck = False
         self.draws: set[str] = set()
         self.early: dict[str, str] = {}
         self.times: list[float] = []
-        self._step_began = time.monotonic()
+        self.step_began = time.monotonic()
 
     def play(
         self,
@@ -218,7 +220,6 @@ class Run:
         except (Exception, SystemExit, LimitReached) as error:
             if not self.is_cut:
                 self.error = error
-                self.is_stuck = time.monotonic() - self._step_began > seconds / 2
         for name, state in global_states().items():
             if state != states[name]:
                 self.draws.add(_GENERATORS[name])
@@ -230,7 +231,7 @@ class Run:
         self.in_main_loop = True
         self.end = "truncated" if simulation.run() is TRUNCATED else "terminated"
         self.in_main_loop = False
-        self.take_fingerprint()
+        self.parts |= self.look()
 
     def play_rules(self, env: Any, seed: int) -> None:
         """Play an episode of an environment with ``RULE`` throughout."""
@@ -238,7 +239,7 @@ class Run:
         env.reset(seed=seed)
         while not env.episode.over:
             env.step(RULE)
-        self.take_fingerprint()
+        self.parts |= self.look()
 
     def play_randomly(
         self,
@@ -251,11 +252,12 @@ class Run:
         The last of ``drawn`` random actions is used at each step; without any, ``RULE``.
         """
         env.reset(seed=seed)  # which also seeds the spaces of the actions
+        self.simulation = env.simulation
         for name in env.agent_iter():
             result = env.last()
             _, _, terminated, truncated, info = result
             agent = env.episode.agents.get(name) or env.episode.ended[name]
-            self.results.append((agent, result))
+            self.results.append((agent, agent.answered, result))
             self.parts |= fingerprint(self.begin_step(name), result)
             self.end = "truncated" if truncated else "terminated"
             action = None
@@ -264,8 +266,6 @@ class Run:
                 for _ in range(drawn):
                     action = env.action_space(name).sample(info.get(MASK))
                 self.actions.append(action)
-                if "time" in info:
-                    self.times.append(info["time"])
                 agent.describe(seed, Where.USER)  # which raises an error if labels do not fit
             yield
             env.step(action)
@@ -276,16 +276,20 @@ class Run:
         """Let the rule decide in a plain run."""
         return hook.function(*args, **kwargs)
 
-    def follow(self, hook: Hook, rule: Rule) -> Rule:
-        """Return the rule of a generator or coroutine function, as the run follows it."""
-        return rule
+    @coroutine
+    def follow(self, hook: Hook, step: str, rule: Rule) -> Rule:
+        """Follow the rule of a generator or coroutine function, and record its result."""
+        return self.end_step(step, (yield from rule))
 
     def begin_step(self, name: str) -> str:
         """Record the call of a decision point or agent; return the name of its step."""
         self.calls.append(name)
-        self._step_began = time.monotonic()
+        self.step_began = time.monotonic()
         step = f"{STEP} {len(self.calls)}, {name}"
         self.parts[step] = "without a result"
+        clock = optional_method(self.simulation, "time")
+        if clock is not None:
+            self.times.append(float(clock()))
         return step
 
     def end_step(self, step: str, value: Model) -> Model:
@@ -293,23 +297,22 @@ class Run:
         self.parts |= fingerprint(step, value, follow=False)
         return value
 
-    def take_fingerprint(self) -> None:
-        """Record the fingerprint of the simulation."""
+    def look(self) -> Fingerprint:
+        """Return the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
             simulation = self.simulation
             state = optional_method(simulation, "state")
             if self.state_of is not None:
-                self.parts |= fingerprint("fingerprint", self.state_of(simulation))
-            elif state is not None:
-                self.parts |= fingerprint("state()", state())
-            else:
-                self.parts |= fingerprint("simulation", simulation)
+                return fingerprint("fingerprint", self.state_of(simulation))
+            if state is not None:
+                return fingerprint("state()", state())
+            return fingerprint("simulation", simulation)
 
     def stop(self) -> NoReturn:
         """Stop the run at the limit of decisions, as often as the model swallows the exit."""
         if not self.is_cut:
             self.is_cut = True
-            self.take_fingerprint()
+            self.parts |= self.look()
         raise LimitReached
 
 
@@ -352,18 +355,15 @@ class Runner:
                 refused[view] = error_text(error)
         return refused
 
-    def call(self, function: Callable[[], object]) -> Run:
-        """Call a function within the time limit."""
-        return Run().play(function, self.seconds)
-
     def run_plainly(self, seed: int, global_seed: int | None = None, run: Run | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
 
         Records the decisions of the rules, in a new ``run`` if none is given. The global generators
         get the same seed, or ``global_seed``.
         """
+        played = run or Run(self.state_of)
 
-        def start(run: Run) -> None:
+        def start() -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
             installation = Installation(self.plan.patches)
             try:
@@ -372,23 +372,19 @@ class Runner:
                     if rng is not None:
                         rng.begin(seed)
                     passing(simulation.reset, "seed", "options")(seed=seed, options=None)
-                    run.run_main_loop(simulation)
+                    played.run_main_loop(simulation)
             finally:
                 installation.uninstall()
 
-        return self.record_rules(start, seed if global_seed is None else global_seed, run)
+        return self.record_rules(played, start, seed if global_seed is None else global_seed)
 
-    def record_rules(self, start: Callable[[Run], None], seed: int, run: Run | None = None) -> Run:
-        """Play a run, and record the decisions of the rules.
-
-        ``start`` plays it.
-        """
-        run = run or Run(self.state_of)
+    def record_rules(self, run: Run, start: Callable[[], object], seed: int) -> Run:
+        """Play a run by a function, and record the decisions of the rules."""
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return run.play(partial(start, run), self.seconds, seed)
+            return run.play(start, self.seconds, seed)
         finally:
             for hook in hooks:
                 hook.replace_rule()
@@ -410,11 +406,7 @@ class Runner:
             if hook.kind == "function":
                 return run.end_step(step, value)
             rule = value.__await__() if hook.kind == "coroutine" else value
-            return wait(step, run.follow(hook, rule))
-
-        @coroutine
-        def wait(step: str, rule: Rule) -> Rule:
-            return run.end_step(step, (yield from rule))
+            return run.follow(hook, step, rule)
 
         return decide
 
@@ -424,7 +416,6 @@ class Runner:
         seed: int,
         *,
         drawn: int = 1,
-        most: int | None = None,
         beside: SimulationAECEnv | None = None,
     ) -> Run:
         """Play an episode with random legal actions.
@@ -433,42 +424,20 @@ class Runner:
             env: The environment.
             seed: The seed of the episode and its actions.
             drawn: Another number gives other actions with the same seed; 0 gives ``RULE``.
-            most: The number of steps after which the episode is broken off.
             beside: Another environment, which is stepped in turns with this one.
         """
         run = Run()
 
         def start() -> None:
             other = iter(()) if beside is None else Run().play_randomly(beside, seed + 1)
-            for _ in islice(run.play_randomly(env, seed, drawn), most):
+            for _ in run.play_randomly(env, seed, drawn):
                 next(other, None)
 
         return run.play(start, self.seconds, seed)
 
-    def apply_waits(self, point: Point, seed: int) -> bool:
-        """Return whether actions at a point take time, because ``apply`` waits.
-
-        If it is not called in an episode of random actions, that is not known, and true.
-        """
-        apply = point.definition.apply
-        if apply is None:
-            return False
-        waits: set[bool] = set()
-
-        @wraps(apply)
-        def record(*args: Model, **kwargs: Model) -> Model:
-            result = apply(*args, **kwargs)
-            waits.add(hasattr(result, "send") or hasattr(result, "__await__"))
-            return result
-
-        plan = self.plan.redefined(point.hook, replace(point.definition, apply=record))
-        env = SimulationAECEnv(plan.amended({"max_steps": self.max_steps}))
-        self.run_randomly(env, seed)
-        return waits != {False}
-
     def sources_of_chance(self, seed: int) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""
-        places: list[str] = []
+        places: dict[str, None] = {}
 
         def profile(frame: FrameType, event: str, function: object) -> None:
             source = _CHANCE.get(function) if event == "c_call" else None
@@ -477,7 +446,7 @@ class Runner:
             if source:
                 place = _innermost(traceback.extract_stack(frame), _LIBRARY)
                 if not place.startswith(_PACKAGE):
-                    places.append(f"{source} at {place}")
+                    places[f"{source} at {place}"] = None
 
         before = sys.getprofile()
         sys.setprofile(profile)
@@ -485,8 +454,7 @@ class Runner:
             self.run_plainly(seed)
         finally:
             sys.setprofile(before)
-        texts = list(dict.fromkeys(places))
-        return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
+        return f"\nin the model, {'; '.join([*places][:3])}" if places else ""
 
 
 # -- where errors and differences come from -------------------------------------------------------

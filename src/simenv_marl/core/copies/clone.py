@@ -177,8 +177,7 @@ def branch(
     if seeds is not None:
         _check_seeds(seeds, n)
         view.session.check_reseed()
-    depth = DEPTH.get() + 1
-    if depth > DEEPEST:
+    if DEPTH.get() == DEEPEST:
         raise BranchError(
             f"branches are nested {DEEPEST} deep: a policy that branches its environment also"
             " decides in the branches, and branches them again; use action_values or RolloutPolicy,"
@@ -191,21 +190,7 @@ def branch(
         )
         results: list[Result] = view.call(branch_there)
         return results
-
-    def call(continuation: Any, number: int) -> Result:
-        token = DEPTH.set(depth)
-        try:
-            twin = getattr(continuation, "unwrapped", continuation)
-            twin.begin_branch()
-            twin.session.move_to(Where.CLONE)
-            if seeds is not None:
-                seed = int(seeds[number])
-                seed_globals(seed, PROCESS)
-                twin.session.reseed(seed)
-            return function(continuation, number)
-        finally:
-            DEPTH.reset(token)
-
+    call = partial(_call_deeper, function, seeds)
     if not is_remote:  # otherwise, the wrappers are in this process
         separate = separator_of(view.session.episode, method)
         if separate is not None:
@@ -254,6 +239,27 @@ def _check_seeds(seeds: Sequence[int], n: int) -> None:
 
 
 # -- branches: clones for one call ----------------------------------------------------------------
+
+
+def _call_deeper(
+    function: Callable[[Any, int], Result],
+    seeds: Sequence[int] | None,
+    continuation: Any,
+    number: int,
+) -> Result:
+    """In a branch, draw the future chance anew if there are seeds, and call a function."""
+    token = DEPTH.set(DEPTH.get() + 1)
+    try:
+        twin = getattr(continuation, "unwrapped", continuation)
+        twin.begin_branch()
+        twin.session.move_to(Where.CLONE)
+        if seeds is not None:
+            seed = int(seeds[number])
+            seed_globals(seed, PROCESS)
+            twin.session.reseed(seed)
+        return function(continuation, number)
+    finally:
+        DEPTH.reset(token)
 
 
 def _call_on_clone(

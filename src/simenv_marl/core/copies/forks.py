@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]  # without the enums of signal, which forks copy
 import os
-import re
 import select
 import socket
 import sys
@@ -19,10 +18,10 @@ from functools import partial
 from math import inf
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Final, TypeVar
 
 from ...errors import BranchError, annotate
+from ...hooks.locks import waits_of, watch_no_locks
 from ...simulation import Model
 from ..switching.context import ExclusiveLock
 from .packing import unpack_outcome
@@ -90,6 +89,7 @@ def _begin_fork(lives: tuple[int, ...], user: int, first: Callable[[], Result]) 
     """In a fork of this module, end with the lives, and call a function."""
     global _this
     _this = _Process(lives, user)
+    watch_no_locks()  # because ``is_stuck`` finds all deadlocks of a process without other threads
     for life in lives:
         _end_with(life)
     return first()
@@ -111,15 +111,12 @@ def _end_with(descriptor: int) -> None:
 
 # -- forks ----------------------------------------------------------------------------------------
 
-_FOREVER: Final = re.compile(r"futex\w+ \w+ 0x\w*[89a-f]\w \w+ 0x0 ")
-"""A wait without a time limit for private memory (a futex), which only its process can end."""
-
 PATIENCE: Final = 2.0
 """After so many seconds without a response, look whether the process can still respond."""
 
 STUCK: Final = (
-    "it was ended, because all its threads waited for locks that nobody releases: a thread that is"
-    " not in the fork held one, or a library cannot be used in forks, such as OpenMP in"
+    "it was ended, because all its threads waited for locks that no thread releases: a thread that"
+    " is not in the fork held one, or a library cannot be used in forks, such as OpenMP in"
     ' scikit-learn, LightGBM and faiss; use method="replay", or have the library use one thread'
     " (OMP_NUM_THREADS=1)"
 )
@@ -228,7 +225,7 @@ class Fork(Peer):
     def is_stuck(self) -> bool:
         """Return whether all threads wait for locks, and did so at the previous call."""
         before = self._waits
-        self._waits = _waits_of(self.process)
+        self._waits = waits_of(self.process)
         return before == self._waits != []
 
     @contextmanager
@@ -307,18 +304,6 @@ def _wait_for(served: object, process: int, options: int = 0) -> None:
     """
     with suppress(ChildProcessError):
         os.waitpid(process, options)
-
-
-def _waits_of(process: int) -> list[str]:
-    """Return where the threads of a process wait. An empty list if one of them may go on."""
-    with suppress(OSError):  # it has ended, or the system hides it
-        waits = [
-            "".join((task / name).read_text() for name in ("wchan", "syscall", "status"))
-            for task in Path(f"/proc/{process}/task").iterdir()
-        ]
-        if all(map(_FOREVER.match, waits)):
-            return waits  # with the status, which counts how often they have run
-    return []
 
 
 def fork(connection: Connection, first: Callable[[], Result]) -> int | Result:

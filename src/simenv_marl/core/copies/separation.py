@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import os
 import random
+import re
 import shutil
 import socket
 import stat
@@ -17,20 +18,19 @@ import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from mmap import mmap
+from pathlib import Path
 from selectors import BaseSelector
 from subprocess import Popen
 from threading import Thread
-from types import FunctionType, ModuleType
 from typing import Any, Final, Protocol
-
-import numpy as np
 
 from ...errors import BranchError
 from ..episodes.episode import Episode
 from ..switching.awaiting import LOOPS
-from ..switching.opened import SHARED_BEFORE, new_epolls, shared_memory
+from ..switching.generators import find_objects
+from ..switching.opened import new_epolls
 from .forks import CAN_FORK, limited
 
 if CAN_FORK:
@@ -62,23 +62,37 @@ class _Opening:
     descriptors: list[int]
 
 
-def _maps_memory(episode: Episode) -> bool:
-    """Return whether the simulation, its module or its frames hold an ``mmap``."""
+_SHARED: Final = re.compile(r"w.s \w+ \w+:\w+ \d+ +(/(?!dev/(?!shm/(?!sem\.)|zero)).*)")
+"""A writable mapping of shared memory: its path. Devices and semaphores do not count."""
+
+_shares_nothing = False  # since the latest look at the mappings, which takes half a millisecond
+
+
+def _note_event(event: str, args: tuple[object, ...]) -> None:
+    global _shares_nothing
+    if event == "mmap.__new__":
+        _shares_nothing = False
+
+
+@cache
+def _watch_mappings() -> None:
+    """Note from now on that memory is mapped. Nothing can undo this."""
+    sys.addaudithook(_note_event)
+
+
+def _shared_memory(episode: Episode) -> list[str]:
+    """Return the paths of memory that processes share, if the simulation holds some memory."""
+    global _shares_nothing
+    _watch_mappings()
+    if _shares_nothing:
+        return []
+    paths = _SHARED.findall(Path("/proc/self/maps").read_text(errors="replace"))
+    _shares_nothing = not paths
     simulation = episode.simulation
     module = sys.modules.get(type(simulation).__module__)
-    queue = [simulation, {} if module is None else vars(module), *episode.driver.variables()]
-    known: set[int] = set()
-    while queue:
-        thing = queue.pop()
-        if isinstance(thing, mmap):
-            return True
-        if id(thing) in known or isinstance(thing, (type, ModuleType, FunctionType)):
-            continue  # these lead to the whole process
-        known.add(id(thing))
-        queue += gc.get_referents(thing)
-        if isinstance(thing, np.ndarray):
-            queue.append(thing.base)
-    return False
+    roots = [simulation, {} if module is None else vars(module), *episode.driver.variables()]
+    is_held = paths and next(find_objects(roots, (mmap,), set()), None) is not None
+    return paths if is_held else []
 
 
 def separator_of(episode: Episode | None, method: str | None) -> Callable[[], None] | None:
@@ -116,16 +130,14 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
             if hasattr(part, "fileno"):
                 held.pop(part.fileno(), None)
     others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
-    shared = shared_memory() - SHARED_BEFORE
-    if shared and _maps_memory(episode):
-        others += [f"shared memory ({path})" for _, path in shared]
+    others += [f"shared memory ({path})" for path in _shared_memory(episode)]
     monkey = sys.modules.get("gevent.monkey")
     if monkey is not None and monkey.is_module_patched("select"):
         others.append("the hub of gevent.monkey")
     if others and method == "fork":
         raise BranchError(
-            f"a forked process cannot continue with {', '.join(others)} that the simulation has"
-            ' opened; use method="replay"'
+            f"a forked process cannot continue with {', '.join(others)} of this process; use"
+            ' method="replay"'
         )
     if others:
         return None

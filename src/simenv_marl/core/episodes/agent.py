@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from math import exp
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from greenlet import getcurrent
 
-from ...errors import AgentError, MaskError
+from ...errors import AgentError, InvalidActionError, MaskError
 from ...hooks.hook import Hook
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
-from ..plans.point import Args, Kwargs, Policy
+from ..plans.point import Args, Kwargs, Point, Policy
 from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
@@ -23,23 +24,18 @@ from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
 from .decision import Decision
 
-if TYPE_CHECKING:
-    from ..plans.point import Point
 
-
+@dataclass(eq=False, slots=True)
 class Clock:
     """Reads the simulation's time.
 
     Attributes:
         time: Returns the simulation's time.
+        rate: The discount rate per unit of time. None: infos have no discount.
     """
 
-    __slots__ = ("_rate", "time")
-
-    def __init__(self, time: Callable[[], float], rate: float | None) -> None:
-        """Read times by a function, and discount by a rate per unit of time if there is one."""
-        self.time = time
-        self._rate = rate
+    time: Callable[[], float]
+    rate: float | None
 
     def read(self, before: float | None) -> dict[str, Any]:
         """Return the time, and the time elapsed since an earlier one, as an info."""
@@ -47,8 +43,8 @@ class Clock:
         time = read()
         now = time if type(time) is float else float(time)
         info: dict[str, Any] = {"time": now, "elapsed": 0.0 if before is None else now - before}
-        if self._rate is not None:
-            info["discount"] = exp(-self._rate * info["elapsed"])
+        if self.rate is not None:
+            info["discount"] = exp(-self.rate * info["elapsed"])
         return info
 
 
@@ -84,12 +80,6 @@ class RunningEpisode(Protocol):
     def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point."""
 
-    def note_entity(self, agent: Agent, entity: Model) -> None:
-        """Note the object as which an agent decides."""
-
-    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
-        """Return the name of the agent as which an entity last decided."""
-
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent."""
 
@@ -100,6 +90,7 @@ class RunningEpisode(Protocol):
         """Note the agent that notes of errors name."""
 
 
+@dataclass(eq=False, repr=False, slots=True)
 class Agent:
     """One agent of an episode.
 
@@ -117,8 +108,8 @@ class Agent:
         plugins: The handlers that take part in its mappings.
         memory: Values of this agent in this episode: of differences, and of policies.
         reward: The reward of its previous action, as of its latest decision or its end.
-        observation: The latest observation, cast to its space. None before the first one; views
-            show ``Point.blank()`` then.
+        raw_observation: The latest observation, where the user cannot have changed it. It is read
+            faster than ``observation``.
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
         choices: The choices of the pending decision. None without ``choices=``.
@@ -136,51 +127,41 @@ class Agent:
         fault: Why its rewards are wrong. Empty as far as is known.
     """
 
-    __slots__ = (
-        "_applying", "_carried", "_is_quick", "answered", "answered_at",
-        "arguments", "asked", "choices", "clock", "decided", "delegated", "ended", "fallbacks",
-        "fault", "handler", "info", "mask", "memory", "name", "noted_action", "now", "observation", "offered",
-        "plugins", "point", "policy", "present", "reward", "rule_action",
-    )  # fmt: skip
+    name: str
+    handler: DecisionHandler
+    policy: Policy
+    delegated: bool
+    clock: Clock | None
+    plugins: Plugins | None
+    point: Point = field(init=False)
+    arguments: Arguments = field(init=False)
+    memory: dict[Any, Any] = field(default_factory=dict)
+    reward: float = 0.0
+    _carried: float = 0.0  # the sum of the rewards of forced moves
+    raw_observation: Observation = None
+    # The numbers of an array that the user has. Empty once the library has read it.
+    _numbers: bytes | None = None
+    info: Info = field(default_factory=dict)
+    mask: Mask | None = None
+    choices: list[Model] | None = None
+    offered: list[Model] | None = None
+    rule_action: Action = None
+    noted_action: Action = None
+    decided: bool = False
+    _is_quick: bool = False  # an update needs no more than an observation and a reward
+    ended: bool = False
+    present: bool = False
+    asked: bool = False
+    answered: int = 0
+    answered_at: float | None = None
+    now: float | None = None
+    fallbacks: int = 0
+    fault: str = ""
+    _applying: int = 0
 
-    def __init__(
-        self,
-        name: str,
-        handler: DecisionHandler,
-        policy: Policy,
-        delegated: bool,
-        clock: Clock | None,
-        plugins: Plugins | None,
-    ) -> None:
-        self.name = name
-        self.handler = handler
-        self.point = point = handler.point
-        self.policy = policy
-        self.delegated = delegated
-        self.arguments = Arguments(point)
-        self.clock = clock
-        self.plugins = plugins
-        self.memory: dict[Any, Any] = {}
-        self.reward = 0.0
-        self._carried = 0.0  # the sum of the rewards of forced moves
-        self.observation: Observation = None
-        self.info: Info = {}
-        self.mask: Mask | None = None
-        self.choices: list[Model] | None = None
-        self.offered: list[Model] | None = None
-        self.rule_action: Action = None
-        self.noted_action: Action = None
-        self.decided = False
-        self._is_quick = False  # an update needs no more than an observation and a reward
-        self.ended = False
-        self.present = False
-        self.asked = False
-        self.answered = 0
-        self.answered_at: float | None = None
-        self.now: float | None = None
-        self.fallbacks = 0
-        self.fault = ""
-        self._applying = 0
+    def __post_init__(self) -> None:
+        self.point = self.handler.point
+        self.arguments = Arguments(self.point)
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -205,7 +186,7 @@ class Agent:
         arguments = self.arguments
         first = arguments.first  # a variable, because calling an attribute is slower
         if not (arguments.is_single and args and first() is args[0]):
-            self.keep(episode, args, kwargs)
+            self.keep(args, kwargs)
         if not episode.is_plain:
             return episode.decide(self, args, kwargs)
         try:
@@ -225,7 +206,8 @@ class Agent:
                 self.info = {}
             else:
                 self.read_clock()
-            self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
+            self.raw_observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
+            self._numbers = None
         except BaseException:
             episode.blame(self)
             raise
@@ -242,6 +224,14 @@ class Agent:
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision: see ``Point.validate``."""
         return self.point.validate(action, self.name, self.mask)
+
+    def allows(self, action: Action) -> bool:
+        """Return whether an action is legal for the pending decision."""
+        try:
+            self.validate(action)
+        except InvalidActionError:
+            return False
+        return True
 
     def only_action(self) -> Action:
         """Return the only legal action of the pending decision. None if there are several."""
@@ -266,6 +256,15 @@ class Agent:
         elif self.answered_at is None:
             self.answered_at = self.now
         return (self, reply) if point.applies and reply is not RULE else reply
+
+    def reply_if_forced(self) -> Model:
+        """Return the reply to a decision with one legal action, and carry its reward on.
+
+        Return this agent if there are several.
+        """
+        forced = self.only_action()
+        self.carry_reward(forced is not None or not self.asked)
+        return self if forced is None else self.reply_to(forced, forced=True)
 
     def _take_choice(self, action: Action, choices: list[Model]) -> Model:
         """Return the choice of an action in a list, and forget the others."""
@@ -330,21 +329,20 @@ class Agent:
 
     # -- arguments --------------------------------------------------------------------------------
 
-    def keep(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
+    def keep(self, args: Args, kwargs: Kwargs) -> None:
         """Hold the arguments of a decision."""
         arguments = self.arguments
-        point = self.point
-        if point.expects_one and args:
+        if args:
             before = arguments.first()
-            if before is not None and before is not args[0]:
-                self.fault = self.handler.warn_of_several(self.name)
+            if arguments.is_single and before is args[0]:
+                return
+            if self.point.expects_one and before is not None and before is not args[0]:
+                self.note_several()
         arguments.store(args, kwargs)
-        if point.agent is None and args:
-            episode.note_entity(self, args[0])
 
-    def is_entity(self, entity: Model) -> bool:
-        """Return whether an object was the first argument of the latest decision."""
-        return self.arguments.first() is entity
+    def note_several(self) -> None:
+        """Note that it decides for several objects."""
+        self.fault = self.handler.warn_of_several(self.name)
 
     # -- rewards and observations -----------------------------------------------------------------
 
@@ -366,31 +364,33 @@ class Agent:
             observe: Whether to observe it.
             last: Whether its episode ends here.
         """
-        if not DIFFERENCES:
-            self._update(args, kwargs, reward, observe, last)
-            return
-        here = getcurrent()
-        before = EVALUATING.get(here)
-        EVALUATING[here] = self
+        here = getcurrent() if DIFFERENCES else None  # differences must know the agent
+        before = None
+        if here is not None:
+            before = EVALUATING.get(here)
+            EVALUATING[here] = self
         try:
-            self._update(args, kwargs, reward, observe, last)
+            point = self.point
+            if reward and self.decided:
+                self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
+            elif reward and not last:  # it has not acted yet, so this value rewards nothing
+                point.reward_mapping(*args, **kwargs)
+                self.decided = True
+                informs = point.definition.rule_action_mapping is not None
+                self._is_quick = point.legal is None and not informs
+            if observe:
+                self._observe(args, kwargs, last)
         finally:
-            if before is None:  # without a function call, which fails at the recursion limit
-                del EVALUATING[here]
-            else:
-                EVALUATING[here] = before
+            if here is not None:
+                # Without a function call, which fails at the recursion limit.
+                if before is None:
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
-    def _update(self, args: Args, kwargs: Kwargs, reward: bool, observe: bool, last: bool) -> None:
-        """Do as ``update`` says. Differences must know the agent."""
+    def _observe(self, args: Args, kwargs: Kwargs, last: bool) -> None:
+        """Set the mask, the info and the observation for the arguments of a call."""
         point = self.point
-        if reward and self.decided:
-            self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
-        elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
-            point.reward_mapping(*args, **kwargs)
-            self.decided = True
-            self._is_quick = point.legal is None and point.definition.rule_action_mapping is None
-        if not observe:
-            return
         self.present = True
         if point.legal is not None:
             self._restrict(args, kwargs, last)
@@ -454,7 +454,8 @@ class Agent:
                     self.info = {}
                 else:
                     self.read_clock()
-                self.observation = cast(observe(entity))
+                self.raw_observation = cast(observe(entity))
+                self._numbers = None
                 return
         if arguments.is_empty:
             self.clear_observation()
@@ -518,8 +519,13 @@ class Agent:
         action, self.rule_action = self.rule_action, None
         return action
 
-    def clear_observation(self) -> None:
-        """Set the reward to 0.0, and the info to one without an observation. The last one stays."""
+    def clear_observation(self, *, forget: bool = False) -> None:
+        """Set the reward to 0.0, and the info to one without an observation.
+
+        ``forget``: whether the last observation goes. Else it stays.
+        """
+        if forget:
+            self.observation = None
         self.reward = 0.0
         self.present = False
         if self.clock is None:
@@ -539,7 +545,33 @@ class Agent:
         info, self.info = self.info, {}
         return info
 
-    def take_observation(self) -> Observation:
-        """Return the observation, and forget it."""
-        observation, self.observation = self.observation, None
-        return observation
+    # -- observations -----------------------------------------------------------------------------
+
+    @property
+    def observation(self) -> Observation:
+        """The latest observation, cast to its space. None before the first one."""
+        numbers = self._numbers
+        self._numbers = b""
+        if numbers:  # the user may have changed the array
+            space: Any = self.point.definition.observation_space
+            self.raw_observation = np.ndarray(space.shape, space.dtype, numbers).copy()
+        return self.raw_observation
+
+    @observation.setter
+    def observation(self, observation: Observation) -> None:
+        self.raw_observation = observation
+        self._numbers = None
+
+    def hand_out(self) -> Observation:
+        """Return the latest observation to the user, who may change it. A blank before the first.
+
+        An array is handed out once without a copy. The bytes of its numbers take a third of the
+        time.
+        """
+        observation = self.raw_observation
+        if observation is None:
+            return self.point.blank()
+        if self._numbers is None and self.point.observes_arrays:
+            self._numbers = observation.tobytes()
+            return observation
+        return duplicate(self.observation)

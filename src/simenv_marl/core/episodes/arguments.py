@@ -123,13 +123,10 @@ def _sequence(kind: Model, elements: list[Model]) -> Model:
     return tuple(living) if issubclass(kind, tuple) else living
 
 
-def _dict(empty: dict[Model, Model], keys: list[Model], values: list[Model]) -> Model:
+def _dict(empty: dict[Model, Model], entries: list[Model]) -> Model:
     """Return a dict. Its entries go with their keys and with their values."""
     made = copy(empty)
-    for entry in zip(keys, values, strict=True):
-        living = _living(entry)
-        if len(living) == 2:
-            made[living[0]] = living[1]
+    made.update(entry for entry in _living(entries) if len(entry) == 2)
     return made
 
 
@@ -169,22 +166,17 @@ def _weaken_container(value: Model, outer: frozenset[int]) -> Model:
     if id(value) in outer:
         return value
     inner = outer | {id(value)}
-    elements = [weaken(element, inner) for element in value]
-    if isinstance(value, (list, tuple)):
-        return value if _is_same(elements, value) else _Held(_sequence, kind, elements)
-    if not isinstance(value, dict):
+    parts = list(value.items() if isinstance(value, dict) else value)
+    elements = [weaken(part, inner) for part in parts]
+    if not isinstance(value, (list, tuple, dict)):
         return _Held(_set, ref(value), kind, elements)
-    parts = [weaken(part, inner) for part in value.values()]
-    if _is_same(elements, value) and _is_same(parts, value.values()):
+    if all(map(is_, elements, parts)):  # nothing is held in another form
         return value
+    if not isinstance(value, dict):
+        return _Held(_sequence, kind, elements)
     empty = copy(value)
     empty.clear()
-    return _Held(_dict, empty, elements, parts)
-
-
-def _is_same(held: list[Model], values: Iterable[Model]) -> bool:
-    """Return whether nothing is held in another form."""
-    return all(map(is_, held, values))
+    return _Held(_dict, empty, elements)
 
 
 def restore(held: Model) -> Model:

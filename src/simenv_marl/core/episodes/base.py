@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -75,6 +76,7 @@ class Replay:
         return self.answers.popleft() if self.answers else WAIT
 
 
+@dataclass(eq=False, repr=False, slots=True, weakref_slot=True)
 class BaseSession(ABC):
     """The base class of sessions. The simulation may be in another process.
 
@@ -89,21 +91,15 @@ class BaseSession(ABC):
             can step it.
     """
 
-    __slots__ = (
-        "__weakref__", "_np_random", "_state", "exclusive", "lock", "np_random_seed", "options",
-        "plan", "seed", "where",
-    )  # fmt: skip
-
-    def __init__(self, plan: Plan, where: Where) -> None:
-        self.plan = plan
-        self.where = where
-        self._state = State.NEW
-        self.seed: int | None = None
-        self.options: ResetOptions = None
-        self.np_random_seed: int | None = None
-        self._np_random: np.random.Generator | None = None
-        self.exclusive = ExclusiveLock()
-        self.lock: ExclusiveLock | None = None
+    plan: Plan
+    where: Where
+    _state: State = State.NEW
+    seed: int | None = None
+    options: ResetOptions = None
+    np_random_seed: int | None = None
+    _np_random: np.random.Generator | None = None
+    exclusive: ExclusiveLock = field(default_factory=ExclusiveLock)
+    lock: ExclusiveLock | None = None
 
     @property
     def np_random(self) -> np.random.Generator:

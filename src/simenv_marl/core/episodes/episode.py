@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from sys import maxsize
-from typing import Protocol
+from typing import Any, Protocol
 from weakref import ref
 
 from greenlet import getcurrent
@@ -45,7 +45,15 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
+from ...simulation import (
+    RULE,
+    TRUNCATED,
+    Action,
+    Function,
+    Model,
+    Sentinel,
+    optional_method,
+)
 from ..plans.plan import Plan
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
@@ -91,13 +99,14 @@ class Episode(EpisodeState):
         called: The functions that end agents and were called.
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
+        memory: The values of policies for all agents.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
         replay: The policy that repeats another episode. None in ordinary episodes.
     """
 
     __slots__ = (
-        "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
-        "_most_steps", "_plugins", "_split", "_tape_size", "_team", "called", "driver", "is_plain", "latest",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps", "_plugins",
+        "_split", "_tape_size", "_team", "called", "driver", "is_plain", "latest", "memory",
         "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
 
@@ -126,8 +135,8 @@ class Episode(EpisodeState):
         self.called: set[Hook] = set()
         self.running = True
         self._failed_in_model = False
-        self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
         self._most_steps = plan.options.max_steps or maxsize
+        self.memory: dict[object, Any] = {}
         self._team: Team | None = None
         if plan.options.team_reward is not None:
             self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
@@ -316,12 +325,11 @@ class Episode(EpisodeState):
             return WAIT
         agent.update(args, kwargs)
         if self.skips:
-            forced = agent.only_action()
-            agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
+            reply = agent.reply_if_forced()
+            if reply is not agent:
                 if self._team is not None:
                     self._team.join(agent)
-                return agent.reply_to(forced, forced=True)
+                return reply
         if self._team is not None:
             self._settle(self._team, [agent])
         return agent
@@ -380,13 +388,11 @@ class Episode(EpisodeState):
         is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
         agent.update(args, kwargs, reward=is_rewarded)
         if self.skips:
-            forced = agent.only_action()
-            if is_rewarded:
-                agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
-                return agent.reply_to(forced, forced=True)
-        if isinstance(policy, AskingPolicy):
-            agent.keep(self, args, kwargs)
+            reply = agent.reply_if_forced()
+            if reply is not agent:
+                return reply
+        if isinstance(policy, EpisodePolicy) and policy.looks_back:
+            agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
         action = self._consult(agent, policy)
@@ -403,7 +409,7 @@ class Episode(EpisodeState):
                 return WAIT
         else:
             self.consulted = agent
-            observation = duplicate(agent.observation)  # which the policy may change
+            observation = duplicate(agent.raw_observation)  # which the policy may change
             try:
                 if isinstance(policy, EpisodePolicy):
                     action = policy.answer(self, agent, observation, agent.info)
@@ -446,7 +452,7 @@ class Episode(EpisodeState):
 
     def _next_item(self, call: SplitCall, reply: Model) -> Event:
         """Return the event of a call's next item. After the last one, resume the simulation."""
-        event = call.next_event(reply)
+        event = call.next_event(reply, self.latest)
         if event is not None:
             return event
         self._split = None
@@ -483,17 +489,6 @@ class Episode(EpisodeState):
             )
         return agent
 
-    def note_entity(self, agent: Agent, entity: Model) -> None:
-        """Note the object as which an agent decides."""
-        self._entities[agent.handler, id(entity)] = agent
-
-    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
-        """Return the name of the agent as which an entity last decided. None if it was none."""
-        agent = self._entities.get((handler, id(entity)))
-        if agent is None or not agent.is_entity(entity):  # a freed object may have had the same id
-            return None
-        return agent.name
-
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
         self.latest = agent
@@ -503,6 +498,21 @@ class Episode(EpisodeState):
         if self.pending is None and not self.over:
             self.pending = self.latest
 
+    def find(self, name: str) -> Agent | None:
+        """Return an agent, whoever answers it. None if it has not appeared."""
+        return self.agent(name) or self.others.get(name)
+
+    def observe_others(self, agent: Agent) -> None:
+        """Observe all live agents but one, as when a round returns. Reward none."""
+        expected_calls = self._expected_calls
+        if expected_calls is not None:
+            for other, (args, kwargs) in self._announced(expected_calls, everyone=True).items():
+                if other is not agent:
+                    other.keep(args, kwargs)
+        for other in (*self.agents.values(), *self.others.values()):
+            if other is not agent:
+                other.refresh(reward=False)
+
     def update_all(self, *, truncated: bool = False) -> None:
         """Reward and observe the live agents when a reset or a round returns.
 
@@ -511,9 +521,11 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        for agent, (args, kwargs) in self._announced().items():
-            if agent is not pending and (in_rounds or not agent.decided):
-                agent.keep(self, args, kwargs)
+        expected_calls = self._expected_calls
+        if expected_calls is not None:
+            for agent, (args, kwargs) in self._announced(expected_calls).items():
+                if agent is not pending and (in_rounds or not agent.decided):
+                    agent.keep(args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return
@@ -530,21 +542,24 @@ class Episode(EpisodeState):
         if in_rounds and self._team is not None:
             self._settle(self._team, self.agents.values())
         self.pending = pending
+        self.latest = pending or self.latest
 
-    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
-        """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
+    def _announced(
+        self, expected_calls: Function, *, everyone: bool = False
+    ) -> dict[Agent, tuple[Args, Kwargs]]:
+        """Return the agents that ``expected_calls`` announces, with the arguments of their call.
+
+        ``everyone``: also those that a policy answers.
+        """
         announced: dict[Agent, tuple[Args, Kwargs]] = {}
-        expected_calls = self._expected_calls
-        if expected_calls is None:
-            return announced
-        for plan_point in self.plan.active:
+        for plan_point in self.plan.points if everyone else self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point
             for call in expected_calls(point.hook.name):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
                     agent = None if name is None else self.agent_for(handler, name)
-                    if agent is not None and not agent.delegated:
+                    if agent is not None and (everyone or not agent.delegated) and not agent.ended:
                         announced.setdefault(agent, (args, kwargs))
         return announced
 

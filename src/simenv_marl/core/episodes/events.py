@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 
 from ...decision import inverse
 from ...errors import InvalidActionError, listed, short_repr, warn_user
@@ -20,8 +19,8 @@ from .agent import Agent, RunningEpisode
 from .arguments import restore
 from .split import SplitHandler
 
-Namer = Callable[[RunningEpisode, Args, Kwargs], Model]
-"""Returns the name of the agent that a call ends."""
+NameAgent = Callable[..., Model]
+"""Returns the name of the agent that a call ends, for the arguments of the call."""
 
 
 class PointHandler:
@@ -35,7 +34,7 @@ class PointHandler:
     def __init__(self, point: Point) -> None:
         self.point = point
         self.report: AnyHandler | None = RuleHandler(point) if point.reports_rule else None
-        self._warnings: dict[str, str] = {}
+        self._problems: set[str] = set()
 
     reports_itself = False
 
@@ -62,14 +61,12 @@ class PointHandler:
 
     def warn_of_several(self, agent: str) -> str:
         """Warn once that several objects decide under the name of one agent. Return the text."""
-        if "several" not in self._warnings:
-            self._warnings["several"] = problem = (
-                f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
-                " rewards and differences mix. Set agent= of its make_step to a callable that names"
-                " each object differently, or to a string if one agent is meant"
-            )
-            warn_user(problem)
-        return self._warnings["several"]
+        return self._warn_once(
+            "several",
+            f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
+            " rewards and differences mix. Set agent= of its make_step to a callable that names"
+            " each object differently, or to a string if one agent is meant",
+        )
 
     def warn_of_gone(self, gone: set[int | str], effect: str) -> str:
         """Warn once that the model has freed arguments that mappings take. Return the text."""
@@ -78,58 +75,72 @@ class PointHandler:
         parameters += [] if signature is None else signature.parameters
         known: dict[int | str, str] = dict(enumerate(parameters))
         names = sorted(known.get(argument, f"argument {argument}") for argument in gone)
-        problem = (
+        return self._warn_once(
+            "gone",
             f"the model has freed {', '.join(names)} of the latest call of"
             f" {self.point.hook.name}, which its mappings take, so {effect} where an agent has"
             " ended or a round has returned. Name the function that removes it in removed_by=, let"
-            " the mapping take _simulation instead, or keep the object in the simulation"
+            " the mapping take _simulation instead, or keep the object in the simulation",
         )
-        if "gone" not in self._warnings:
-            self._warnings["gone"] = problem
+
+    def _warn_once(self, kind: str, problem: str) -> str:
+        if kind not in self._problems:
+            self._problems.add(kind)
             warn_user(problem)
         return problem
 
 
+@dataclass(eq=False)
 class RemovalHandler(Observer):
-    """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
+    """Handles calls that end agents. It changes nothing in the simulation: the function runs.
 
-    def __init__(self, hook: Hook, roster: Collection[str], last: AnyHandler | None) -> None:
-        """Handle calls of a hook. ``last`` handles their ends."""
-        self._hook = hook
-        self._last = last
-        self._removals: list[tuple[PointHandler | None, Namer]] = []
-        self._roster = roster
-        self._has_warned = False
+    Attributes:
+        hook: The hook of the function.
+        roster: The names of the agents that are known beforehand.
+        last: Handles the ends of the calls. None: nothing does.
+    """
+
+    hook: Hook
+    roster: Collection[str]
+    last: AnyHandler | None
+    # The handlers of points, the classes of agents, and the callables that name agents.
+    _removals: list[tuple[PointHandler | None, type | None, NameAgent | None]] = field(
+        default_factory=list
+    )
+    _has_warned: bool = False
 
     @property
     def report(self) -> AnyHandler | None:
         """Handles the ends of calls."""
-        return self._last
+        return self.last
 
     def add(self, handler: PointHandler | None, remover: Remover) -> None:
         """Let calls end agents of a point. None: any agents."""
-        if handler is None:
-            self._removals.append((None, _name_of_end_agent))
-            return
-        name_agent = handler.point.removed_by[remover.name]
-        namer: Namer = partial(_name_of_entity, handler, remover.owner)
+        name_agent = None if handler is None else handler.point.removed_by[remover.name]
         if name_agent is not None:
-            call = adapt(name_agent, "removed_by", remover.hook).call
-            namer = partial(_name_of_call, call)
-        self._removals.append((handler, namer))
+            name_agent = adapt(name_agent, "removed_by", remover.hook).call
+        self._removals.append((handler, remover.owner, name_agent))
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Give the agents their last rewards and observations; then let the function run."""
-        episode.called.add(self._hook)
+        episode.called.add(self.hook)
         # All names come first, because the end of an agent may change them.
-        named = [(handler, name(episode, args, kwargs)) for handler, name in self._removals]
+        named = []
+        for handler, owner, name_agent in self._removals:
+            if name_agent is not None:
+                name = name_agent(*args, **kwargs)
+            elif handler is None:
+                name = args[1]  # ``SimulationInterface.end_agent`` gets it after the simulation
+            else:
+                name = _name_of_entity(episode, handler, owner, args)
+            named.append((handler, name))
         for handler, name in named:
             agent = episode.agents.get(name)
             if agent is not None and handler in (None, agent.handler):
                 episode.end_agent(agent)
             elif handler is None and name is not None and not self._has_warned:
                 known = [*episode.agents, *episode.others, *episode.ended]
-                if name in known or name in self._roster:
+                if name in known or name in self.roster:
                     continue
                 self._has_warned = True
                 warn_user(
@@ -150,19 +161,8 @@ class LastHandler(Observer):
         return WAIT
 
 
-def _name_of_end_agent(episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
-    """Return the name that ``SimulationInterface.end_agent`` gets after the simulation."""
-    return args[1]
-
-
-def _name_of_call(
-    name_agent: Callable[..., Model], episode: RunningEpisode, args: Args, kwargs: Kwargs
-) -> Model:
-    return name_agent(*args, **kwargs)
-
-
 def _name_of_entity(
-    handler: PointHandler, owner: type | None, episode: RunningEpisode, args: Args, kwargs: Kwargs
+    episode: RunningEpisode, handler: PointHandler, owner: type | None, args: Args
 ) -> Model:
     """Return the name of the agent that is the first argument of a call. None if it is none."""
     point = handler.point
@@ -171,7 +171,12 @@ def _name_of_entity(
     if point.agent is not None:
         return point.agent
     name = point.name_agent(args[0])
-    return episode.named_before(handler, args[0]) if name is None else name
+    if name is not None:
+        return name
+    for agent in reversed(episode.agents.values()):  # an entity may have been another agent before
+        if agent.handler is handler and agent.arguments.first() is args[0]:
+            return agent.name
+    return None
 
 
 class RuleHandler(Observer):

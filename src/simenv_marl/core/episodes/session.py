@@ -25,7 +25,7 @@ from ...errors import (
     warn_user,
 )
 from ...hooks.handlers import Installation
-from ...hooks.places import is_outdated
+from ...hooks.places import homes_of, is_outdated
 from ...simulation import Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
@@ -53,8 +53,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation",
-        "_warned_of_outdated", "context", "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_defined", "_driver", "_homes", "_installed", "_reset", "_rng",
+        "_simulation", "context", "episode", "handlers", "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
@@ -75,7 +75,8 @@ class Session(BaseSession):
         self.context: Callable[..., environment_context] = partial(
             environment_context, plan.plugins, self._rng, self.lock
         )
-        self._warned_of_outdated = False
+        self._homes = homes_of([hook for hook, _ in plan.patches])
+        self._defined: list[Model] = []  # the functions and classes there, at the latest reset
         self._close: Callable[..., Model] | None = None  # set by a reset, called once
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
@@ -172,10 +173,13 @@ class Session(BaseSession):
                 self._state = State.NEW if self.episode is None else State.OVER
 
     def _warn_of_outdated(self) -> None:
-        """Warn once of functions that were defined again since they were named."""
+        """Warn of functions that were defined again since they were named."""
+        defined = [namespace.get(name) for namespace, name in self._homes]
+        if defined == self._defined:
+            return
+        self._defined = defined
         names = [hook.name for hook, _ in self.plan.patches if is_outdated(hook)]
-        if names and not self._warned_of_outdated:
-            self._warned_of_outdated = True
+        if names:
             warn_user(
                 "these were defined again, by a reload or a cell that ran again:"
                 f" {listed(names)}. Calls of the new functions are no decisions here; name them in"

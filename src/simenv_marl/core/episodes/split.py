@@ -14,7 +14,7 @@ from ...hooks.stacks import Interceptor
 from ...simulation import RULE, Model
 from ..plans.point import Args, Kwargs
 from ..switching.driver import Event
-from .agent import DecisionHandler, RunningEpisode
+from .agent import Agent, DecisionHandler, RunningEpisode
 
 
 class SplittingEpisode(RunningEpisode, Protocol):
@@ -94,7 +94,8 @@ class SplitHandler:
                         f"the rule of {hook.name}, in another process, decides for all items of a"
                         " call or for none; answer all of them by RULE, or none"
                     )
-                decision = point.part_of(result, item, place, args, kwargs)
+                part = point.part
+                decision = part(result, item, *args, **kwargs) if part else result[place]
                 by_rule.append((decision, (item, *args), kwargs))
             elif point.deliver is not None:
                 value = point.deliver(reply, item, *args, **kwargs)
@@ -119,6 +120,7 @@ class SplitCall:
         args: The positional arguments of the call.
         kwargs: Its keyword arguments.
         replies: The replies to the first items.
+        decided: The item that each agent has decided first.
     """
 
     handler: DecisionHandler
@@ -126,6 +128,7 @@ class SplitCall:
     args: Args
     kwargs: Kwargs
     replies: list[Model] = field(default_factory=list)
+    decided: dict[Agent, Model] = field(default_factory=dict)
 
     def event(self) -> Event:
         """Return the event of the first item without a reply."""
@@ -136,9 +139,16 @@ class SplitCall:
             kwargs = {**kwargs, "_answers": answers}
         return self.handler, (self.items[len(self.replies)], *self.args), kwargs
 
-    def next_event(self, reply: Model) -> Event | None:
-        """Note the reply to an item. Return the event of the next one, or None at the end."""
+    def next_event(self, reply: Model, agent: Agent | None) -> Event | None:
+        """Note the reply to an item, and the agent that decided last.
+
+        Return the event of the next one, or None at the end.
+        """
+        item = self.items[len(self.replies)]
         self.replies.append(reply)
+        has_named = reply is not RULE and self.handler.point.agent is None
+        if has_named and agent is not None and self.decided.setdefault(agent, item) is not item:
+            agent.note_several()
         return None if len(self.replies) == len(self.items) else self.event()
 
     def reply(self) -> Model:

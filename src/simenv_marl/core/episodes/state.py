@@ -168,8 +168,9 @@ class EpisodeState:
     """
 
     __slots__ = (
-        "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined", "just_ended", "others", "outcome",
-        "pending", "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
+        "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined", "just_ended",
+        "others", "outcome", "pending", "plan", "round", "seed", "skips", "turns",
+        "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(

@@ -31,7 +31,14 @@ from ...hooks.handlers import Handler
 from ...hooks.hook import Hook
 from ...hooks.stacks import outside_simulation
 from ...plugins import Plugins
-from ...simulation import RULE, Model, SimulationInterface, make_simulation, optional_method
+from ...simulation import (
+    EVERYONE,
+    RULE,
+    Model,
+    SimulationInterface,
+    make_simulation,
+    optional_method,
+)
 from ..switching.driver import Driver
 from ..switching.greenlets import GreenletDriver
 from ..switching.threads import ThreadDriver
@@ -197,6 +204,7 @@ class Plan:
         points: The decision points that do not run their rule.
         active: The decision points that the environment's user answers.
         policies: The policies of agents, by name.
+        everyone: The policy of all agents without one. None: there is none.
         has_planner: Whether a policy asks for the environment, and so may branch it.
         has_split: Whether a call of the model may hold several decisions.
         named_agents: The agents that ``policies`` and ``possible_agents`` name.
@@ -217,6 +225,7 @@ class Plan:
     points: tuple[Point, ...]
     active: tuple[Point, ...]
     policies: Mapping[str, Policy]
+    everyone: Policy
     has_planner: bool
     has_split: bool
     named_agents: frozenset[str]
@@ -257,7 +266,7 @@ class Plan:
         if policy is not None:
             return policy
         if not self.has_user or (self.one_agent is not None and agent != self.one_agent):
-            return RULE
+            return self.everyone or RULE
         if not self.complete or agent in self.roster:
             return None
         if self.options.undeclared == "rule":
@@ -373,15 +382,17 @@ def make_plan(
         )
     prototype: Prototype | None = None
     inspected = source
-    has_no_points = points is None and getattr(source, "points", None) is None
-    if has_no_points or not isinstance(source, type):
+    named = getattr(source, "points", None) if points is None else points
+    if named is None or not isinstance(source, type):
         prototype = Prototype(source, checked.driver)
         inspected = prototype.simulation
     if points is None:
         points = getattr(inspected, "points", None)
     if points is None and not has_user and default_policy is None:
         policies = checked.policies or {}
-        names_agents = any(isinstance(key, str) and "." not in key for key in policies)
+        names_agents = any(
+            key is EVERYONE or (isinstance(key, str) and "." not in key) for key in policies
+        )
         if not names_agents:
             points = ()  # the points in ``policies`` are enough
     own = own_points(inspected)
@@ -423,16 +434,21 @@ def _resolve(subject: Subject, options: Options) -> Plan:
     only = options.agent if options.agent in known else None
     has_user = subject.mode is Mode.ENVIRONMENT
     collects = subject.mode is Mode.COLLECT
+    everyone = (options.policies or {}).get(EVERYONE)
+    if has_user and everyone is not None and options.agent is None:
+        raise OptionValueError(
+            "a policy for all agents leaves no decision to the environment; name the agent that its"
+            " user answers with agent="
+        )
+    default = subject.default_policy if has_user or everyone is None else everyone
     points: list[Point] = []
     active: list[Point] = []
     for hook, definition in definitions.items():
         agent = agents[hook]
-        policy = by_point.get(hook, subject.default_policy)
+        policy = by_point.get(hook, default)
         if options.agent is not None and agent != only:
-            policy = policy or RULE
-        policies = [policy, *by_agent.values()]
-        if agent is not None:
-            policies = [by_agent.get(agent, policy)]
+            policy = policy or everyone or RULE
+        policies = [policy, *by_agent.values()] if agent is None else [by_agent.get(agent, policy)]
         if policy is RULE and policies == [RULE]:
             continue
         clips = options.clip_actions
@@ -473,6 +489,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         points=tuple(points),
         active=tuple(active),
         policies=by_agent,
+        everyone=everyone,
         has_planner=any(
             isinstance(policy, AskingPolicy) and policy.plans
             for policy in (*by_point.values(), *by_agent.values())

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol, TypeAlias
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
-from ...decision import DecisionPoint, Definition, fit_labels, inverse, parts_of
+from ...decision import DecisionPoint, Definition, inverse, parts_of, texts_of
 from ...errors import (
     DefinitionError,
     InvalidActionError,
@@ -80,6 +80,7 @@ class Point:
         policy: The policy that answers all decisions of the point. None: the agents' own policies
             answer them, or the environment's user does.
         cast: Casts an observation to the observation space.
+        observes_arrays: Whether observations are arrays.
         check: Checks an action against the action space. Returns it in the form that ``convert``
             takes, or ``ILLEGAL``.
         applies: Whether an ``apply`` gets the action, on the simulation's side.
@@ -110,9 +111,9 @@ class Point:
     __slots__ = (
         "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
         "deliver", "expects_one", "gather", "gives_answers", "hook", "legal", "masked_parts",
-        "name_agent", "needs_simulation", "observation_mapping", "part", "policy", "removed_by",
-        "reports_rule", "reward_mapping", "rule_action_mapping", "split", "taken_keys",
-        "taken_places", "takes_for_observation", "takes_for_reward",
+        "name_agent", "needs_simulation", "observation_mapping", "observes_arrays", "part",
+        "policy", "removed_by", "reports_rule", "reward_mapping", "rule_action_mapping", "split",
+        "taken_keys", "taken_places", "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
 
     def __init__(
@@ -143,6 +144,7 @@ class Point:
         self.agent = agent
         self.policy = policy
         self.cast = spaces.observation_cast(definition.observation_space)
+        self.observes_arrays = isinstance(definition.observation_space, spaces.ArraySpace)
         self.check = actions.action_check(definition.action_space, clips=clips)
         self.applies = definition.apply is not None
         is_invertible = definition.choices is not None or inverse(definition) is not None
@@ -152,8 +154,8 @@ class Point:
         self.expects_one = names_one and hook.bound
         callables = (*vars(definition).values(), *definition.removed_by.values())
         self.needs_simulation = any(asks_for(part, "_simulation") for part in callables)
-        asks_for_answers = any(asks_for(part, "_answers") for part in callables)
-        self.gives_answers = definition.split is not None and asks_for_answers
+        is_split = definition.split is not None
+        self.gives_answers = is_split and any(asks_for(part, "_answers") for part in callables)
         self.fit_callables(None)
 
     def bind(self, simulation: Model) -> Point:
@@ -195,9 +197,7 @@ class Point:
             self.taken_keys = taken.difference(places)
         self.convert: Callable[[Action], Model] = parts["action_space_mapping"] or _same
         self.legal = self._legal()
-        self.masked_parts: list[str] = []
-        if self.legal is not None:
-            self.masked_parts = _masked_parts(definition.observation_space)
+        self.masked_parts = _masked_parts(definition.observation_space) if self.legal else []
         self.deliver = self._delivery()
         self.split = calls.get("split")
         self.gather = calls.get("gather")
@@ -231,10 +231,6 @@ class Point:
             return RULE
         answer = reply[1] if self.applies else reply
         return answer[0] if self.definition.choices is not None else answer
-
-    def part_of(self, result: Model, item: Model, place: int, args: Args, kwargs: Kwargs) -> Model:
-        """Return the part of the rule's result that is for an item of a split call."""
-        return result[place] if self.part is None else self.part(result, item, *args, **kwargs)
 
     def _legal(self) -> Callable[[Args, Kwargs], tuple[Mask, list[Model] | None]] | None:
         """Make the function that returns the mask of a call, and its choices."""
@@ -308,21 +304,17 @@ class Point:
         """
         if callable(labels):
             labels = self._calls[name](*args, **kwargs)
-            # Labels of a Discrete may leave out the illegal actions of this call.
-            is_partial = isinstance(space, gym_spaces.Discrete) and isinstance(labels, Mapping)
-            is_partial = is_partial and labels.keys() <= set(parts_of(space) or ())
-            if not is_partial and not fit_labels(space, labels):
-                raise DefinitionError(
-                    f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
-                    f" not texts for the parts of {short_repr(space)}"
-                )
+        # Labels of a Discrete may leave out the illegal actions of this call.
+        texts = {} if labels is None else texts_of(space, labels, all_parts=False)
+        if texts is None:
+            raise DefinitionError(
+                f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
+                f" not texts for the parts of {short_repr(space)}"
+            )
         parts = parts_of(space)
         if parts is None:
             return None
-        texts = (
-            labels if isinstance(labels, Mapping) else dict(zip(parts, labels or (), strict=False))
-        )
-        named = {part: str(texts.get(part, part)) for part in parts}
+        named = {part: texts.get(part, str(part)) for part in parts}
         has_keys = isinstance(space, (gym_spaces.Discrete, gym_spaces.Dict))
         return named if has_keys else tuple(named.values())
 
@@ -354,8 +346,8 @@ class Point:
                 f" {short_repr(space)}"
             )
             try:
-                for clips in (True, False):  # parts that can be clipped are named last
-                    actions.action_check(space, clips=clips, raises=True)(action)
+                actions.action_check(space, clips=True, raises=True)(action)
+                actions.action_check(space, raises=True)(action)  # it names what can be clipped
             except InvalidActionError as error:
                 if error.__cause__ is not None:  # an element of it is illegal
                     problem += f": {error}"

@@ -40,7 +40,7 @@ from ...hooks.places import (
     raw_attribute,
     resolve,
 )
-from ...simulation import RULE, Model
+from ...simulation import EVERYONE, RULE, Model
 from .point import Point, Policy
 from .policies import two_arguments
 
@@ -83,12 +83,12 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
 
 def owner_class(point: DecisionPoint) -> type | None:
     """Return the class of a method. None for other points, or if the class is gone."""
+    owner: object = None
     if isinstance(point, PlacedHook):
-        return point.owner if isinstance(point.owner, type) else None
-    try:
-        owner, _ = resolve(point.name)
-    except (UnknownPointError, PatchError):
-        return None
+        owner = point.owner
+    else:
+        with suppress(UnknownPointError, PatchError):
+            owner, _ = resolve(point.name)
     return owner if isinstance(owner, type) else None
 
 
@@ -103,13 +103,11 @@ def overrides(point: DecisionPoint) -> list[DecisionPoint]:
     attribute = point.name.rpartition(".")[2]
     found: list[DecisionPoint] = []
     for kind in all_classes(owner):
-        if kind is owner or attribute not in vars(kind):
+        function = unwrap(vars(kind).get(attribute))
+        if kind is owner or not isinstance(function, FunctionType):
             continue
-        code = getattr(unwrap(vars(kind)[attribute]), "__code__", None)
-        names = set() if code is None else set(code.co_names)
-        bases = ["super", *(base.__name__ for base in kind.__mro__)]
-        if attribute in names and not names.isdisjoint(bases):
-            continue
+        if attribute in function.__code__.co_names:
+            continue  # it calls the point, by super() or by the name of a class
         with suppress(PatchError):
             hook = hook_at(f"{kind.__module__}.{kind.__qualname__}.{attribute}", kind, attribute)
             if hook.definition is None and not getattr(hook, "inherited", False):
@@ -140,11 +138,8 @@ def find_points(
     for key, given in pairs:
         point, definition = find_point(key, given, own=own)
         earlier = keys.setdefault(point, key)
-        # The class has a wrapper of a function that is a key already, while an environment lives.
-        is_wrapper = (
-            earlier is not key and not isinstance(key, str) and not isinstance(earlier, str)
-        )
-        if point in found and not is_wrapper:
+        # While an environment lives, the class has a wrapper of a function that is a key already.
+        if point in found and (earlier is key or str in (type(key), type(earlier))):
             raise UnknownPointError(f"the decision point {point.name} was named twice")
         found[point] = definition
     if not found and not empty:
@@ -179,7 +174,7 @@ def find_point(
         )
     point = locate(key, own)
     if not isinstance(key, str):  # a name means the latest definition, a decision function its own
-        definition = definition or made_with(getattr(key, "__func__", key))
+        definition = definition or made_with(key)
     definition = definition or own.get(point) or point.definition or _inherited(point)
     if definition is None:
         raise DefinitionError(
@@ -217,18 +212,14 @@ def agent_names(definitions: Definitions) -> dict[DecisionPoint, str | None]:
     owners: dict[str, DecisionPoint] = {}
     for point, definition in definitions.items():
         agent = definition.agent
-        if isinstance(agent, str):
-            if agent in owners:
-                other = owners[agent].name
-                raise AgentError(f"{other} and {point.name} have the same agent {agent!r}")
-            owners[agent] = point
+        if isinstance(agent, str) and owners.setdefault(agent, point) is not point:
+            raise AgentError(f"{owners[agent].name} and {point.name} have the same agent {agent!r}")
     names: dict[DecisionPoint, str | None] = {}
     for point, definition in definitions.items():
         agent = definition.agent
         if agent is None:
             defaults = (f"{point.letters}_{number}" for number in count())
-            agent = next(name for name in defaults if name not in owners)
-            owners[agent] = point
+            agent = next(name for name in defaults if owners.setdefault(name, point) is point)
         names[point] = agent if isinstance(agent, str) else None
     return names
 
@@ -282,6 +273,8 @@ def resolve_policies(
     definitions = dict(named)
     agents = agent_names(named).values()
     for key, value in policies.items():
+        if key is EVERYONE:
+            continue
         policy = value if value is RULE else two_arguments(value)
         if isinstance(key, str) and key in agents:
             by_agent[key] = policy

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
@@ -223,10 +223,14 @@ class EpisodePolicy(ABC):
 
     Attributes:
         waits: Whether it must be awaited.
+        batched: Whether it answers many decisions in one call, where many wait.
+        looks_back: Whether it needs the arguments of decisions that were answered before.
         policy: The user's policy, for errors.
     """
 
     waits = False
+    batched = False
+    looks_back = False
     policy: Policy
 
     @abstractmethod
@@ -234,6 +238,16 @@ class EpisodePolicy(ABC):
         self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
     ) -> Action:
         """Answer one decision at once."""
+
+    def respond(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Answer one decision, perhaps with a tuple of the action and a dict of extras."""
+        return self.answer(episode, agent, observation, info)
+
+    def respond_to_many(self, agents: Sequence[Any], infos: Sequence[Info]) -> Action:
+        """Answer the decisions of some agents, as a policy of ``simulate_many`` does."""
+        raise NotImplementedError
 
     def __call__(self, observation: Observation, info: Info) -> Action:
         """Refuse a call without an episode."""
@@ -254,6 +268,8 @@ class AskingPolicy(EpisodePolicy):
         plans: Whether it gets the environment.
         asks: Whether it gets the decision.
     """
+
+    looks_back = True
 
     def __init__(self, policy: Callable[..., Action]) -> None:
         self.policy = policy

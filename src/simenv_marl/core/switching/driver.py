@@ -13,12 +13,13 @@ hook gets an interceptor, which sends an event and carries out the reply.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from asyncio import _get_running_loop as running_loop
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
 from sys import exception, modules
-from threading import Thread, local
-from types import coroutine
+from threading import Thread, get_ident, local
+from types import FrameType, coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 from weakref import WeakSet, ref
 
@@ -29,7 +30,7 @@ from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Function, Model, Sentinel
-from .exits import ASYNCIO, LoopExit, SimulationExit, is_exit, make_exit
+from .exits import LoopExit, SimulationExit, is_exit, make_exit
 from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
 
@@ -156,12 +157,14 @@ class Driver(ABC):
         opened: The resources that the simulation has opened. None before the first one.
         stale: Whether code of an earlier stack may still use the simulation, so that it must be
             made anew.
+        user: The number of the thread that began the latest job.
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_loop", "_outcome", "_prepare",
-        "_refused", "_running_loop", "_spawned", "_stack", "_thread", "_users_loop", "caller",
-        "ended", "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
+        "__weakref__", "_context", "_deadlock", "_exiting", "_handled", "_home", "_loop",
+        "_outcome", "_prepare", "_refused", "_spawned", "_stack", "_thread",
+        "_users_loop", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
+        "plugins", "stale", "user",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
@@ -198,7 +201,6 @@ class Driver(ABC):
         self._exiting = False
         self._prepare: Callable[[], Job] | None = None  # until the job begins
         self._context = Context()  # of the job, until it begins
-        self._running_loop: Callable[[], object] | None = None  # None until asyncio is imported
         self._loop = NO_LOOP  # of the simulation, while it waits
         self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
@@ -232,6 +234,8 @@ class Driver(ABC):
             prepare: Returns the job. It runs on the stack, too, where decisions follow the rule
                 until it has returned.
         """
+        self.user = get_ident()
+        self._deadlock: str | None = None  # why the job waits for ever
         self._make_stack()
         self._prepare = prepare
         self.events = {}
@@ -241,10 +245,15 @@ class Driver(ABC):
 
     def variables(self) -> Iterator[dict[str, Model]]:
         """Yield the variables of each frame of the suspended simulation."""
-        frame = None if self._stack is None else self._stack.gr_frame
+        frame = self.frame
         while frame is not None:
             yield frame.f_locals
             frame = frame.f_back
+
+    @property
+    def frame(self) -> FrameType | None:
+        """The innermost frame of the simulation while it is suspended."""
+        return None if self._stack is None else self._stack.gr_frame
 
     @property
     def reachable(self) -> bool:
@@ -301,6 +310,8 @@ class Driver(ABC):
                 self.give_up(
                     f"neither decided anything nor ended within {SECONDS_TO_UNWIND} s; it is"
                     " abandoned"
+                    if self._deadlock is None
+                    else "waits for a lock; it is abandoned"
                 )
                 break
             if event is ENDED:
@@ -322,6 +333,10 @@ class Driver(ABC):
         """Note why the job on the stack cannot be unwound."""
         self.given_up = reason
 
+    def note_deadlock(self, text: str) -> None:
+        """Note why the job waits for ever. An interrupt of it becomes an error with this text."""
+        self._deadlock = text
+
     # -- on the simulation's side -----------------------------------------------------------------
 
     def _decider(
@@ -336,7 +351,8 @@ class Driver(ABC):
         bind = hook.bind
 
         def decide(args: Args, kwargs: Kwargs) -> Model:
-            if type(exception()) is GeneratorExit:  # see ``interceptor``
+            # See ``interceptor``. The first comparison is the fastest.
+            if exception() is not None and type(exception()) is GeneratorExit:
                 if self._exiting:
                     raise make_exit()
                 return rule(*args, **kwargs)
@@ -349,12 +365,7 @@ class Driver(ABC):
                 bound, named = call
             if away:
                 self._reply_to(getcurrent())
-            running = self._running_loop
-            if running is None and ASYNCIO in modules:
-                running = self._running_loop = modules[ASYNCIO]._get_running_loop
-            looped = running is not None and (
-                running() is not None or self._users_loop[0] is not None
-            )
+            looped = running_loop() is not None or self._users_loop[0] is not None
             if looped:
                 self._loop = swap_loop(self._users_loop)
             leave = self._leave
@@ -370,7 +381,7 @@ class Driver(ABC):
                 raise
             if away:
                 self._reply_to(None)
-            if looped or (running is not None and running() is not None):
+            if looped or running_loop() is not None:
                 self._enter_loop()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)
@@ -427,6 +438,8 @@ class Driver(ABC):
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
+        if self._deadlock is not None and isinstance(error, KeyboardInterrupt):
+            return SimulationError(self._deadlock).with_traceback(error.__traceback__)
         refused = self._refused
         if refused is not None and refused is not error:
             if isinstance(error, SimulationExit):

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
+from asyncio import AbstractEventLoop, Runner, _get_running_loop
 from collections.abc import Callable
 from functools import partial
-from sys import modules
 from traceback import walk_stack
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any
 
 from greenlet import getcurrent, greenlet
 
 from ...errors import error_text
 from ...hooks.stacks import STACKS
 from ...simulation import Model
-
-if TYPE_CHECKING:
-    from asyncio import AbstractEventLoop
-
-ASYNCIO: Final = "asyncio.events"
-"""The module that knows a thread's running event loop. If it is not imported, no loop runs."""
 
 Context = dict[str, Any]
 """The context that an event loop passes to its exception handler."""
@@ -72,7 +66,7 @@ def make_exit() -> SimulationExit:
     if hasattr(here, "NOT_ERROR"):  # gevent's hub, which has spawned this greenlet
         _spare_hub(here)
         return LoopExit()
-    loop = modules[ASYNCIO]._get_running_loop() if ASYNCIO in modules else None
+    loop = _get_running_loop()
     if loop is None:
         return SimulationExit()
     _silence(loop)
@@ -85,7 +79,7 @@ def _spare_hub(hub: Model) -> None:
 
 
 def _is_closing_loop() -> bool:
-    close = modules["asyncio"].Runner.close.__code__
+    close = Runner.close.__code__
     return any(frame.f_code is close for frame, _ in walk_stack(None))
 
 

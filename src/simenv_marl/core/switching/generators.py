@@ -2,7 +2,7 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from functools import cache
 from gc import get_referents
 from numbers import Real
@@ -243,8 +243,7 @@ _SKIPPED: Final = (
     type,
     ModuleType,
     CodeType,
-    # They lead to no generator with a seed.
-    np.ndarray,
+    # They lead to nothing else.
     str,
     int,
     float,
@@ -325,28 +324,44 @@ def generators_of(simulation: Model) -> Iterator[Model]:
 
     ``Streams`` count as one.
     """
+    known = {id(PYTHON), id(NUMPY)}
+    for generator in find_objects([simulation], _GENERATORS, known):
+        yield generator
+        if isinstance(generator, Streams):
+            known.update(map(id, generator.values()))
+
+
+def find_objects(
+    roots: Iterable[Model], kinds: tuple[type, ...], known: set[int]
+) -> Iterator[Model]:
+    """Yield the objects of some classes that others hold, the nearest first, each of them once.
+
+    Args:
+        roots: The other objects.
+        kinds: The classes.
+        known: The identities of objects to leave out. Those of all objects are added.
+    """
 
     @cache
     def classify(kind: type) -> bool | None:
-        """Return whether objects of a class are generators. None: they are not searched."""
+        """Return whether objects of a class are yielded. None: they are not searched."""
         if hasattr(kind, "__globals__") or issubclass(kind, _SKIPPED):  # functions have globals
             return None
-        return issubclass(kind, _GENERATORS)
+        return issubclass(kind, kinds)
 
-    known = {id(PYTHON), id(NUMPY)}
-    queue = deque([simulation])
+    queue = deque(roots)
     while queue:
         thing = queue.popleft()
-        is_generator = classify(type(thing))  # type: ignore[arg-type] # mypy doubts its hash
-        if is_generator is None or id(thing) in known:
+        is_wanted = classify(type(thing))  # type: ignore[arg-type] # mypy doubts its hash
+        if is_wanted is None or id(thing) in known:
             continue
         known.add(id(thing))
-        if not is_generator:
-            queue.extend(get_referents(thing))
+        if is_wanted:
+            yield thing
             continue
-        yield thing
-        if isinstance(thing, Streams):
-            known.update(map(id, thing.values()))
+        queue.extend(get_referents(thing))
+        if isinstance(thing, np.ndarray):
+            queue.append(thing.base)
 
 
 def _seed_bits(bits: BitGenerator, stream: SeedSequence) -> None:

@@ -15,6 +15,7 @@ from typing import Final
 from greenlet import GreenletExit, getcurrent, greenlet
 
 from ...errors import WrongThreadError, warn_user
+from ...hooks.locks import watch_locks
 from ...hooks.stacks import STACKS
 from ...simulation import Model
 from .driver import ENDED, THREAD, Driver, Event
@@ -30,6 +31,7 @@ class GreenletDriver(Driver):
     # -- on the user's side -----------------------------------------------------------------------
 
     def _make_stack(self) -> None:
+        watch_locks(self._stack)
         if self._stack is None:
             stack = greenlet(begin_stack(self._serve))
             # Or the ``switch`` of a greenlet of the model that waits for an answer.

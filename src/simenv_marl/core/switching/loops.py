@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from sys import modules
+from asyncio import AbstractEventLoop, _get_running_loop, _set_running_loop
 from typing import TYPE_CHECKING, Final
 
-from .exits import ASYNCIO
-
 if TYPE_CHECKING:
-    from asyncio import AbstractEventLoop
     from sys import _asyncgen_hooks
 
-LoopState = tuple["AbstractEventLoop | None", "_asyncgen_hooks | tuple[None, None]", int]
+LoopState = tuple[AbstractEventLoop | None, "_asyncgen_hooks | tuple[None, None]", int]
 """The running loop of a thread, its hooks of asynchronous generators, and its tracking depth."""
 
 NO_LOOP: Final[LoopState] = (None, (None, None), 0)
@@ -21,15 +18,13 @@ NO_LOOP: Final[LoopState] = (None, (None, None), 0)
 
 def swap_loop(state: LoopState) -> LoopState:
     """Return the state of this thread. Set another state if one of the two has a loop."""
-    events = modules.get(ASYNCIO)
-    if events is None:
-        return NO_LOOP
-    loop = events._get_running_loop()
+    loop = _get_running_loop()
     present = loop, sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
     if loop is None and state[0] is None:
+        _set_running_loop(None)  # Python finds it faster from now on
         return present
     wanted, hooks, depth = state
-    events._set_running_loop(wanted)
+    _set_running_loop(wanted)
     sys.set_asyncgen_hooks(*hooks)
     sys.set_coroutine_origin_tracking_depth(depth)
     return present

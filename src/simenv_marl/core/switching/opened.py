@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, wraps
 from itertools import starmap
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from socket import socket
 from subprocess import Popen
 from threading import Thread
@@ -51,22 +49,6 @@ _EPOLLS_BEFORE: Final = _epolls()
 def new_epolls() -> set[int]:
     """Return the descriptors of the epoll objects that the process has made since then."""
     return _epolls() - _EPOLLS_BEFORE
-
-
-_SHARED: Final = re.compile(r"w.s \w+ \w+:\w+ (\d+) +(/(?!dev/(?!shm/(?!sem\.)|zero)).*)")
-"""A writable mapping of shared memory: its inode and path. Devices and semaphores do not count."""
-
-
-def shared_memory() -> set[tuple[str, str]]:
-    """Return the memory that this process shares with others: inodes and paths."""
-    maps = ""
-    with suppress(OSError):  # only Linux has this file
-        maps = Path("/proc/self/maps").read_text(errors="replace")
-    return set(_SHARED.findall(maps))
-
-
-SHARED_BEFORE: Final = shared_memory()
-"""The memory that the process shared when this module was imported."""
 
 
 def watch_resources() -> None:

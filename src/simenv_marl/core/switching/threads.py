@@ -5,12 +5,15 @@ from __future__ import annotations
 from contextlib import suppress
 from contextvars import Context
 from queue import Empty, SimpleQueue
+from sys import _current_frames
 from threading import Thread
+from types import FrameType
 from typing import Final
 
 from greenlet import greenlet
 
-from ...errors import WrongThreadError
+from ...errors import SimulationError, WrongThreadError
+from ...hooks.locks import LOOKS, explain_wait
 from ...hooks.stacks import SIMULATION
 from ...simulation import Model, Sentinel
 from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event
@@ -64,9 +67,26 @@ class ThreadDriver(Driver):
     def resume(self, reply: Model) -> Event:
         """Resume the simulation with a reply; return its next event."""
         self._replies.put(reply if self._prepare is None else _JOB)
+        looks = 0
         while True:
             with suppress(Empty):
                 return self._arrived.get(True, _LONGEST_WAIT)
+            looks += 1
+            running = self._innermost()
+            if looks % LOOKS == 0 and running is not None:
+                with suppress(Exception):  # the simulation may go on meanwhile
+                    self._deadlock = explain_wait(running, self.user)
+                if self._deadlock is not None:
+                    raise SimulationError(self._deadlock)
+
+    def _innermost(self) -> FrameType | None:
+        return _current_frames().get(getattr(self._thread, "ident", 0))
+
+    @property
+    def frame(self) -> FrameType | None:
+        """The innermost frame of the simulation while it is suspended."""
+        frame = self._innermost()
+        return frame if frame and frame.f_code.co_name == "_leave" else None
 
     def throw(self) -> Event | None:
         """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs.
@@ -75,7 +95,7 @@ class ThreadDriver(Driver):
         """
         self._replies.put(_EXIT)
         try:
-            return self._arrived.get(True, SECONDS_TO_UNWIND)
+            return self._arrived.get(self._deadlock is None, SECONDS_TO_UNWIND)
         except Empty:
             return None
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from ...errors import InvalidActionError, ViewError, short_repr
 from ...simulation import Action, Observation
-from .actions import ILLEGAL, Check, Mask, action_check
+from .actions import ILLEGAL, Check, Mask, action_check, open_mask
 from .spaces import Array, Space, duplicate
 
 Encode: TypeAlias = Callable[[Observation], Observation]
@@ -116,15 +116,16 @@ def common_actions(
     most = max(sizes)
     longest = max(lengths)
     if not longest:
-        return spaces.Discrete(most), [_Numbered(part, most) for part in parts]
+        numbers = [part for part in parts if isinstance(part, spaces.Discrete)]
+        return spaces.Discrete(most), [_Numbered(part, most) for part in numbers]
     common = spaces.Box(-1.0, 1.0, (most + longest,), np.float32)
     check = action_check(common, clips=clips)
     codes: list[ActionCode] = []
     for part in parts:
-        if isinstance(part, spaces.Box):
-            codes.append(_Scaled(part, common, check, most))
-        else:
+        if isinstance(part, spaces.Discrete):
             codes.append(_Preferred(part, common, check, most))
+        elif isinstance(part, spaces.Box):
+            codes.append(_Scaled(part, common, check, most))
     return common, codes
 
 
@@ -146,8 +147,7 @@ class _Same:
     """The code of an agent whose own space is the common one."""
 
     def __init__(self, own: Space) -> None:
-        is_discrete = isinstance(own, spaces.Discrete)
-        self._open = np.ones(own.n, np.int8) if is_discrete else None
+        self._open = open_mask(own) if isinstance(own, spaces.Discrete) else None
 
     def decode(self, action: Action, mask: Mask | None) -> Action:
         return action
@@ -156,9 +156,8 @@ class _Same:
         return action
 
     def widen(self, mask: Mask | None) -> Mask | None:
-        if mask is None:
-            return None if self._open is None else self._open.copy()
-        return duplicate(mask)
+        own: Mask | None = duplicate(self._open if mask is None else mask)
+        return own
 
 
 class _Numbered:

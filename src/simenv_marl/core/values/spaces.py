@@ -213,37 +213,36 @@ def _convert_items(
     refuse: Callable[[Observation], Observation],
     value: Observation,
 ) -> Observation:
-    """Do as a function of ``by_parts`` does, for elements with other parts each time."""
+    """Do as a function of ``by_parts`` does, for elements with other parts each time.
+
+    The parts become an element of a ``Dict`` or a ``Tuple``.
+    """
     part: Any
-
-    def convert(key: object, part: Space, item: Observation) -> Observation:
-        try:
-            return make(part)(item)
-        except _REFUSALS as error:
-            raise type(error)(f"in the element {key!r}: {error}") from error
-
     try:
         match space:
             case OneOf(spaces=options):
                 key, item = value
-                return np.int64(key), convert(key, dict(enumerate(options))[key], item)
+                chosen = Dict({key: dict(enumerate(options))[key]})
+                return np.int64(key), make(chosen)({key: item})[key]
             case Sequence(feature_space=part, stack=True):
                 return make(batch_space(part, _size(part, value)))(value)
             case Sequence(feature_space=part) if not isinstance(value, (str, Mapping)):
-                return tuple([convert(key, part, item) for key, item in enumerate(value)])
+                return make(Tuple([part] * len(value)))(list(value))
             case Graph(node_space=part):
                 nodes, edges, links = value
                 number = _size(part, nodes)
-                nodes = convert("nodes", batch_space(part, number), nodes)
-                if edges is None and links is None:
-                    return GraphInstance(nodes, None, None)
-                part = space.edge_space
-                size = _size(part, edges)
-                edges = convert("edges", batch_space(part, size), edges)
-                ends: Space = Box(0, number - 1, (size, 2), np.int64)
-                links = convert("edge_links", ends, links)
-                if ends.contains(links):
-                    return GraphInstance(nodes, edges, links)
+                parts = {"nodes": batch_space(part, number)}
+                items = {"nodes": nodes}
+                if edges is not None or links is not None:
+                    part = space.edge_space
+                    size = _size(part, edges)
+                    parts["edges"] = batch_space(part, size)
+                    parts["edge_links"] = Box(0, number - 1, (size, 2), np.int64)
+                    items |= {"edges": edges, "edge_links": links}
+                graph = make(Dict(parts))(items)
+                ends = parts.get("edge_links")
+                if ends is None or ends.contains(graph["edge_links"]):
+                    return GraphInstance(*map(graph.get, GraphInstance._fields))
     except _REFUSALS:
         raise
     except (TypeError, ValueError, LookupError, AssertionError):

@@ -27,7 +27,7 @@ from ...errors import (
     did_you_mean,
     short_repr,
 )
-from ...simulation import Action, Model
+from ...simulation import Action, Model, check_seconds
 from ..descriptions import JSON, at_decision
 from .forms import Message, action_of, jsonable, pending_decision, picture_of
 from .futures import MOST_MEASURES, Futures
@@ -122,8 +122,8 @@ class Game:
         Raises:
             OptionValueError: An argument has an invalid value, or the episode cannot begin.
         """
-        if self.limit is not None and not 0 < self.limit < 1e6:
-            raise OptionValueError(f"limit must be a positive number of seconds, not {self.limit}")
+        if self.limit is not None:
+            check_seconds(self.limit, "limit")
         modes = aec_env(self.simulation).metadata["render_modes"]
         mode = next((mode for mode in ("rgb_array", "ansi") if mode in modes), None)
         self.root = self.env = aec_env(self.simulation, render_mode=mode)

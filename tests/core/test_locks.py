@@ -1,0 +1,328 @@
+"""Locks that a suspended simulation holds while another simulation waits for them."""
+
+import gc
+import os
+import sys
+import threading
+import time
+import warnings
+from contextlib import contextmanager
+from functools import cached_property
+from queue import SimpleQueue
+
+import pytest
+
+from simenv_marl import clone, single_env
+from simenv_marl.core.switching import threads
+from simenv_marl.errors import SimulationError
+from simenv_marl.hooks import locks
+from simenv_marl.hooks.stacks import STACKS
+from tests.worlds.models import define
+
+DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
+TASKS = "/proc/self/task"
+LISTED = os.path.exists(TASKS)
+NOT_LISTED = "the system does not list threads"
+
+
+class Model:
+    """A simulation with one decision, inside ``work``."""
+
+    lock = threading.Lock()
+
+    def reset(self):
+        self.own = threading.Lock()
+
+    def run(self):
+        self.work()
+
+    def work(self):
+        self.decide()
+
+    def decide(self):
+        return 0
+
+
+class Fills(Model):
+    def work(self):
+        with self.lock:
+            if self is None:
+                return
+            self.decide()
+
+
+class Drains(Model):
+    def work(self):
+        Model.lock.acquire()
+        try:
+            self.decide()
+        finally:
+            Model.lock.release()
+
+
+class Counts(Model):
+    lock = threading.Semaphore()
+
+    def work(self):
+        with self.lock:
+            self.decide()
+
+
+class Guards(Model):
+    """A lock that the frames of the suspended simulation do not show."""
+
+    @contextmanager
+    def guard(self):
+        with self.lock:
+            yield
+
+    def work(self):
+        with self.guard():
+            self.decide()
+
+
+def synchronized(function):
+    def locked(*args):
+        with Model.lock:
+            return function(*args)
+
+    return locked
+
+
+class Synchronizes(Model):
+    run = synchronized(Model.run)
+
+
+class Enters(Model):
+    def __init__(self):
+        with self.lock:
+            self.made = True
+
+
+class Caches(Model):
+    @cached_property
+    def plan(self):
+        return self.decide()
+
+    def work(self):
+        return self.plan
+
+    def reset(self):
+        vars(self).pop("plan", None)
+
+
+ONE_LOCK = sys.version_info < (3, 12)  # for each ``cached_property``
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    """Look more often than a second, and leave no watching thread."""
+    monkeypatch.setattr(locks, "PERIOD", 0.05)
+    monkeypatch.setattr(threads, "_LONGEST_WAIT", 0.05)
+    yield
+    wait_for(lambda: len(STACKS) > 1 or not locks._stops)  # other tests may leave simulations
+
+
+def wait_for(condition):
+    end = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def env_of(model, driver):
+    return single_env(model, points={Model.decide: define(agent="a_0")}, driver=driver)
+
+
+def begin(model, driver, envs):
+    envs.append(env_of(model, driver))
+    envs[-1].reset()
+
+
+# -- told -----------------------------------------------------------------------------------------
+
+
+@DRIVERS
+@pytest.mark.parametrize(
+    ("holder", "waiter"),
+    [
+        (Fills, Fills),
+        (Drains, Drains),
+        (Fills, Drains),
+        (Drains, Fills),
+        (Counts, Counts),
+        (Fills, Enters),
+        (Fills, Synchronizes),
+        pytest.param(Guards, Guards, marks=pytest.mark.skipif(not LISTED, reason=NOT_LISTED)),
+        pytest.param(Caches, Caches, marks=pytest.mark.skipif(not ONE_LOCK, reason="has no lock")),
+    ],
+)
+def test_a_lock_that_a_suspended_simulation_holds_is_an_error(driver, holder, waiter):
+    if driver == "greenlet" and holder is Caches:
+        pytest.skip("greenlets of a thread share its RLock")
+    first = env_of(holder, driver)
+    first.reset()
+    envs = []
+    with warnings.catch_warnings(action="ignore"), pytest.raises(SimulationError) as caught:
+        begin(waiter, driver, envs)  # gives up the thread
+    text = str(caught.value)
+    for kind in (holder, waiter):
+        assert f"{kind.__name__} object at 0x" in text
+    assert ("in plan" if holder is Caches else f"in {holder.__name__}.") in text
+    first.step(0)  # it goes on, and releases the lock
+    first.close()
+    for second in envs:
+        second.reset()
+        second.close()
+
+
+@DRIVERS
+def test_a_wait_in_another_thread_is_told_on_stderr(driver, capfd):
+    def use():
+        first.reset()
+        second.reset()  # waits
+        second.close()
+        Model.lock.acquire()  # for the first
+        first.close()
+
+    first = env_of(Fills, driver)
+    second = env_of(Drains, driver)
+    user = threading.Thread(target=use)
+    user.start()
+    told = ""
+    end = time.monotonic() + 5
+    while "The other simulation" not in told and time.monotonic() < end:
+        told += capfd.readouterr().err
+        time.sleep(0.05)
+    time.sleep(0.5)
+    told += capfd.readouterr().err
+    Model.lock.release()
+    user.join(5)
+    assert not user.is_alive()
+    assert told.count("simenv_marl: ") == 1
+    assert "Drains object at 0x" in told.partition("waits for a lock that")[0]
+    assert "Fills object at 0x" in told.partition("waits for a lock that")[2]
+    assert told.count("in work\n") == 2  # both stacks
+
+
+# -- not told -------------------------------------------------------------------------------------
+
+
+TIMERS = []
+
+
+class Sleeps(Model):
+    def run(self):
+        self.later(lambda: None)
+        time.sleep(0.4)
+        self.decide()
+
+    def later(self, function):
+        timer = threading.Timer(0.4, function)
+        timer.start()
+        TIMERS.append(timer)
+
+
+class Queues(Sleeps):
+    def run(self):
+        queue = SimpleQueue()
+        self.later(lambda: queue.put(1))
+        queue.get()
+        with self.lock:
+            self.decide()
+
+
+class Lends(Sleeps):
+    """A lock of each object, that a thread releases."""
+
+    def run(self):
+        self.own.acquire()
+        self.later(self.own.release)
+        with self.own:
+            self.decide()
+
+
+class Leaves(Sleeps):
+    """A lock of the class, that each object has left before it decides."""
+
+    def run(self):
+        with self.lock:
+            self.passed = True
+        Model.lock.acquire()
+        Model.lock.release()
+        self.decide()
+        Model.lock.acquire()
+        self.later(Model.lock.release)
+        with self.lock:
+            self.decide()
+        with self.lock:
+            self.decide()
+
+
+class Tries(Model):
+    def work(self):
+        if self.lock.acquire(timeout=0.4):
+            self.lock.release()
+        self.decide()
+
+
+@DRIVERS
+@pytest.mark.parametrize("model", [Sleeps, Queues, Lends, Leaves, Tries])
+def test_a_wait_that_ends_by_itself_is_not_told(driver, model, capfd):
+    first = env_of(Leaves if model is Leaves else Lends if model is Lends else Model, driver)
+    second = env_of(model, driver)
+    if model is Tries:
+        Model.lock.acquire()
+    first.reset()
+    second.reset()
+    if model is Leaves:
+        second.step(0)
+    second.close()
+    first.close()
+    if model is Tries:
+        Model.lock.release()
+    while TIMERS:
+        TIMERS.pop().join()
+    assert capfd.readouterr().err == ""
+
+
+# -- the watching thread --------------------------------------------------------------------------
+
+
+def test_one_simulation_alone_is_not_watched():
+    gc.collect()
+    if STACKS:
+        pytest.skip("other tests have left simulations")
+    wait_for(lambda: not locks._stops)
+    env = env_of(Model, "greenlet")
+    env.reset()
+    assert not locks._stops
+    env.close()
+
+
+def fork():
+    """Fork a process that ends at once. Return how many threads this process has then."""
+    process = os.fork()
+    if process == 0:
+        os._exit(0)
+    number = len(os.listdir(TASKS))
+    os.waitpid(process, 0)
+    return number
+
+
+@pytest.mark.skipif(not LISTED, reason=NOT_LISTED)
+def test_forks_end_the_watching_thread():
+    alone = fork()  # threads of NumPy end at forks, too
+    listed = threading.enumerate()
+    first, second = [env_of(Model, "greenlet") for _ in range(2)]
+    first.reset()
+    for _ in range(20):
+        second.reset()
+        assert threading.enumerate() == listed
+        assert len(os.listdir(TASKS)) == alone + 1
+        assert fork() == alone
+    second.reset()
+    branch = clone(second, method="fork")
+    assert len(os.listdir(TASKS)) == alone
+    for env in (branch, first, second):
+        env.close()

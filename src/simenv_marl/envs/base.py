@@ -40,6 +40,7 @@ from ..core import (
     unpack,
 )
 from ..errors import (
+    AgentError,
     UnknownAgentError,
     UnknownOptionError,
     ViewError,
@@ -65,7 +66,9 @@ _OWN_OPTIONS = {
 }
 """The options that not every view takes."""
 
-_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session", "turn"))
+_NOT_COPIED = frozenset(
+    ("_finalizer", "_lock", "_roster", "joint", "own_agent", "own_seat", "session", "turn")
+)
 """The attributes that each view makes for itself."""
 
 
@@ -147,6 +150,14 @@ class View:
         for option, views in _OWN_OPTIONS.items():
             if getattr(plan.options, option) and option not in cls._own_options:
                 raise UnknownOptionError(f"{option} is an option of {views} only")
+        first: dict[str, Point] = {}
+        for point in plan.active:
+            other = first.setdefault(point.agent, point) if point.agent else point
+            if not plan.can_share(point, other):
+                raise AgentError(
+                    f"{other.hook.name} and {point.hook.name} have the same agent {point.agent!r},"
+                    " but their spaces differ; name the agents differently, or use turn_env"
+                )
         return plan
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp
 from typing import Any, NamedTuple, NoReturn, Self
 
@@ -167,8 +168,10 @@ class SimulationTurnEnv(OneAgentView):
             bounds; for both, one whose first n parts are preferences for the actions of a
             ``Discrete`` (the largest legal one is taken).
         turn: The agents, united into one learner.
+        own_seat: The seat of the agent whose decision is pending, or was the last one.
     """
 
+    own_seat: Seat
     _own_options = ("flatten", "state_in_info")
     _agent_name = "turn"
     _last_time: float | None = None  # the time of the previous reset or step
@@ -179,6 +182,12 @@ class SimulationTurnEnv(OneAgentView):
         episode = self.session.episode
         if episode is not None and episode.pending is not None:
             self.own_agent = episode.pending
+            self.own_seat = self.turn.seat(episode.pending)
+
+    @classmethod
+    def adapt(cls, plan: Plan) -> Plan:
+        """Check that a plan allows this view, and let agents decide at points of any spaces."""
+        return super().adapt(replace(plan, unites=True))
 
     @classmethod
     def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
@@ -197,6 +206,7 @@ class SimulationTurnEnv(OneAgentView):
             agents = (*episode.agents.values(), *episode.ended.values())
             agent = next(agent for agent in agents if agent.decided)
         self.own_agent = agent
+        self.own_seat = self.turn.seat(agent)
         return self.turn.observe(agent), self._info(episode, agent)
 
     def step(self, action: Action) -> StepResult:
@@ -237,6 +247,7 @@ class SimulationTurnEnv(OneAgentView):
         """Return the observation, the reward and the info of a step."""
         turn = self.turn
         before = self.own_agent
+        seat = self.own_seat
         agent = episode.pending
         if agent is None:
             agent = before
@@ -244,6 +255,7 @@ class SimulationTurnEnv(OneAgentView):
         else:
             reward = agent.reward
             self.own_agent = agent
+            self.own_seat = turn.seat(agent)
         if episode.just_ended:
             reward += sum([each.reward for each in episode.take_ended()])
         if episode.earned is not None:
@@ -254,7 +266,7 @@ class SimulationTurnEnv(OneAgentView):
             if agent is not before:  # else it is of an earlier step
                 noted = before.noted_action
             if noted is not None:
-                info[RULE_ACTION] = turn.seat(before).code.encode(noted)
+                info[RULE_ACTION] = seat.code.encode(noted)
         return turn.observe(agent), reward, info
 
     def _info(self, episode: EpisodeState, agent: Agent) -> Info:

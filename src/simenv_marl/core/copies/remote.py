@@ -96,7 +96,7 @@ class Mirror(EpisodeState):
         self.just_ended = []
         for name, point, fields in report.agents:
             agent = self.agent(name)
-            if agent is None:
+            if agent is None or agent.point is not self.plan.points[point]:
                 handler = PointHandler(self.plan.points[point])
                 agent = Agent(name, handler, None, False, self.clock, None)
             agent.load(dict(zip(FIELDS, fields, strict=True)))

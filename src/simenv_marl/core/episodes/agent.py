@@ -70,6 +70,7 @@ class RunningEpisode(Protocol):
     others: dict[str, Agent]
     ended: dict[str, Agent]
     called: set[Hook]
+    moved: set[str]
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision where more than an update is due."""
@@ -82,6 +83,9 @@ class RunningEpisode(Protocol):
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent."""
+
+    def note_first_decision(self) -> None:
+        """Note that an agent decides for the first time."""
 
     def finish(self, *, truncated: bool) -> None:
         """End the episode of all live agents."""
@@ -191,6 +195,8 @@ class Agent:
             return episode.decide(self, args, kwargs)
         try:
             if DIFFERENCES or not self._is_quick:
+                if not self.decided:
+                    episode.note_first_decision()
                 self.update(args, kwargs)
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
@@ -212,6 +218,17 @@ class Agent:
             episode.blame(self)
             raise
         return self
+
+    def move_to(self, handler: DecisionHandler) -> None:
+        """Let it decide at another point from now on."""
+        self.raw_observation = self.observation  # read in the space of the point so far
+        self.handler = handler
+        self.point = point = handler.point
+        self.arguments = Arguments(point)
+        self.mask = None
+        self.choices = None
+        informs = point.definition.rule_action_mapping is not None
+        self._is_quick = self.decided and point.legal is None and not informs
 
     def refusal(self) -> AgentError:
         """Make the error for a decision after the end of its episode."""

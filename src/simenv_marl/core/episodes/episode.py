@@ -100,14 +100,16 @@ class Episode(EpisodeState):
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
         memory: The values of policies for all agents.
+        moved: The names of agents that have decided at several points.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
         replay: The policy that repeats another episode. None in ordinary episodes.
     """
 
     __slots__ = (
-        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps", "_plugins",
-        "_split", "_tape_size", "_team", "called", "driver", "is_plain", "latest", "memory",
-        "replay", "running", "session", "simulation", "tape",
+        "_context", "_deciders", "_expected_calls", "_failed_in_model", "_handlers",
+        "_most_steps", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
+        "is_plain", "latest", "memory", "moved", "replay", "running", "session", "simulation",
+        "tape",
     )  # fmt: skip
 
     def __init__(
@@ -137,6 +139,8 @@ class Episode(EpisodeState):
         self._failed_in_model = False
         self._most_steps = plan.options.max_steps or maxsize
         self.memory: dict[object, Any] = {}
+        self.moved: set[str] = set()
+        self._deciders = 0
         self._team: Team | None = None
         if plan.options.team_reward is not None:
             self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
@@ -157,7 +161,7 @@ class Episode(EpisodeState):
         handlers = dict(self._handlers.by_hook)
         for agent in self.agents.values():
             point = agent.point
-            if point.agent is not None and point.split is None:
+            if point.hook in self._handlers.alone:
                 handlers[point.hook] = agent
         return handlers
 
@@ -323,6 +327,8 @@ class Episode(EpisodeState):
         if self.turns >= self._most_steps:  # the user has taken the last step
             self.finish(truncated=True)
             return WAIT
+        if not agent.decided:
+            self.note_first_decision()
         agent.update(args, kwargs)
         if self.skips:
             reply = agent.reply_if_forced()
@@ -347,6 +353,7 @@ class Episode(EpisodeState):
             return agent
         self.latest = agent
         if not agent.decided:  # it acts before it was ever updated
+            self.note_first_decision()
             args, kwargs = agent.arguments.recall()
             agent.update(args, kwargs, observe=False)
             if self._team is not None:
@@ -483,11 +490,21 @@ class Episode(EpisodeState):
             agent = self._make_agent(name, handler)
             (self.others if agent.delegated else self.agents)[name] = agent
         elif agent.handler is not handler:
-            raise AgentError(
-                f"the agent {name!r} decides at {agent.point.hook.name} and at {here}; an agent has"
-                " one decision point: give each point's agents names of their own"
-            )
+            policy = self.plan.policy_of(name, handler.point)
+            if policy is not agent.policy or not self.plan.can_share(agent.point, handler.point):
+                raise AgentError(
+                    f"the agent {name!r} decides at {agent.point.hook.name} and at {here}, whose"
+                    " spaces or policies differ: give each point's agents names of their own, or"
+                    " use turn_env, which unites spaces"
+                )
+            agent.move_to(handler)
+            self.moved.add(name)
         return agent
+
+    def note_first_decision(self) -> None:
+        """Note that an agent decides for the first time."""
+        self.has_joined = self.has_joined or self.turns > (1 if self.in_rounds else self._deciders)
+        self._deciders += 1
 
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""

@@ -216,6 +216,7 @@ class Plan:
         removers: The functions whose calls end agents.
         overrides: The functions that override each of the points, and are no points.
         plugins: The handlers for this environment's simulation only. None if there are none.
+        unites: Whether a view unites the spaces of all agents.
         patches: The hooks, and the handlers with their hooks, that must be set while an environment
             is in use.
     """
@@ -237,6 +238,11 @@ class Plan:
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
 
+    unites: bool = False
+
+    _shared: dict[tuple[DecisionPoint, DecisionPoint], bool] = field(
+        init=False, default_factory=dict
+    )
     _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
 
     def derive(self, function: Callable[[Plan], Model]) -> Model:
@@ -276,6 +282,21 @@ class Plan:
             " possible_agents; declare it, or let its rule decide with"
             ' undeclared="rule"'
         )
+
+    def can_share(self, one: Point, other: Point) -> bool:
+        """Return whether an agent may decide at both of two points.
+
+        Their spaces are equal, or no view of agents shows them.
+        """
+        if self.unites or not self.has_user:
+            return True
+        pair = one.hook, other.hook
+        if pair not in self._shared:
+            self._shared[pair] = (
+                one.definition.observation_space == other.definition.observation_space
+                and one.definition.action_space == other.definition.action_space
+            )
+        return self._shared[pair]
 
     def is_delegated(self, policy: Policy) -> bool:
         """Return whether agents with a policy are no agents of the environment."""
@@ -496,7 +517,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         ),
         has_split=any(point.split is not None for point in points),
         named_agents=frozenset({*by_agent, *options.declared_agents} - ruled),
-        one_agent=active[0].agent or options.agent if len(active) == 1 else None,
+        one_agent=_one_agent(active, options),
         roster=roster,
         complete=complete,
         removers=removers,
@@ -507,6 +528,14 @@ def _resolve(subject: Subject, options: Options) -> Plan:
             *((handler.target, handler) for handler in handlers),
         ),
     )
+
+
+def _one_agent(active: Collection[Point], options: Options) -> str | None:
+    """Return the only agent that the user answers. None if there may be several."""
+    names = {point.agent for point in active}
+    if len(names) > 1 or (len(active) > 1 and None in names):
+        return None
+    return next(iter(names), None) or options.agent
 
 
 def _checked_render_mode(subject: Subject, options: Options) -> Options:
@@ -542,8 +571,10 @@ def _choose_one(
             f"agent={short_repr(agent)} names no agent of the environment; its agents are"
             f" {', '.join(names)}{did_you_mean(agent, names)}"
         )
-    points = [roster[agent]] if complete else active
-    if len(points) > 1:
+    points = active
+    if complete:
+        points = [point for point in active if point.agent == agent] or [roster[agent]]
+    elif len(points) > 1:
         raise AgentError(
             f"the agent {short_repr(agent)} may decide at"
             f" {', '.join(point.hook.name for point in points)}; name its decision point in"

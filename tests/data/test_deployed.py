@@ -8,6 +8,7 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
+    difference,
     evaluate,
     joint_env,
     simulate,
@@ -19,6 +20,7 @@ from simenv_marl import (
 from simenv_marl.core import pack, unpack
 from simenv_marl.data import collect_episodes, joint_policy, turn_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, ViewError
+from simenv_marl.experiments import run_experiment
 from tests.worlds.models import calling, decision, define
 
 SEEDS = range(4)
@@ -211,3 +213,22 @@ def test_refusals_name_the_remedy():
     assert simulate(
         calling(ant), turn_policy(lambda observation: RULE, like=env), points=[ant]
     ).log == ["rule"]
+
+
+def test_the_teams_reward_counts_once_in_evaluations(tmp_path):
+    env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
+    contenders = {"rule": {}, "turn": turn_policy(predict, like=env)}
+    options = {"points": POINTS, "team_reward": difference(lambda bakery: bakery.heat)}
+    result = evaluate(Bakery, contenders, seeds=SEEDS, metric=lambda s: s.heat, **options)
+    table = run_experiment(
+        Bakery, [{}], contenders=contenders, seeds=SEEDS, store=tmp_path, **options
+    )
+    again = run_experiment(
+        Bakery, [{}], contenders=contenders, seeds=SEEDS, store=tmp_path, **options
+    )
+    for frame in (result.frame, table, again):
+        teams = frame[frame.agent == "team"].set_index(["contender", "seed"])["return"]
+        for seed in SEEDS:
+            heat = simulate(Bakery, contenders["turn"], points=POINTS, seed=seed).heat
+            assert teams["turn", seed] == pytest.approx(heat)
+            assert teams["rule", seed] == 0.0

@@ -340,6 +340,11 @@ class Episode(EpisodeState):
             self._settle(self._team, [agent])
         return agent
 
+    @property
+    def total(self) -> float | None:
+        """What the team has earned in the episode. None if each agent has rewards of its own."""
+        return None if self._team is None else self._team.total
+
     def _settle(self, team: Team, agents: Collection[Agent]) -> None:
         """Pay agents their share of the team's reward, before a reset or a step returns."""
         team.settle(agents)

@@ -19,9 +19,9 @@ from .episodes.agent import Agent
 from .episodes.base import BaseSession, checked_seed, close_all
 from .episodes.decision import Decision
 from .episodes.episode import Episode
-from .episodes.round import Round
 from .episodes.session import Session
 from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
+from .episodes.steps import Round
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space

@@ -150,12 +150,11 @@ class View:
         for option, views in _OWN_OPTIONS.items():
             if getattr(plan.options, option) and option not in cls._own_options:
                 raise UnknownOptionError(f"{option} is an option of {views} only")
-        first: dict[str, Point] = {}
         for point in plan.active:
-            other = first.setdefault(point.agent, point) if point.agent else point
-            if not plan.can_share(point, other):
+            first = plan.roster.get(point.agent or "", point)
+            if not plan.can_share(point, first):
                 raise AgentError(
-                    f"{other.hook.name} and {point.hook.name} have the same agent {point.agent!r},"
+                    f"{first.hook.name} and {point.hook.name} have the same agent {point.agent!r},"
                     " but their spaces differ; name the agents differently, or use turn_env"
                 )
         return plan
@@ -377,16 +376,10 @@ class View:
 
     def warn_of_losses(self, episode: EpisodeState) -> None:
         """Warn once if an episode in rounds has used fewer than nine in ten actions."""
-        played = episode.round
-        if played is None or self._has_warned_of_losses or 10 * played.used >= 9 * played.given:
-            return
-        self._has_warned_of_losses = True
-        warn_user(
-            f"of {played.given} actions in this episode, {played.used} were used: the agents do not"
-            " decide in each round, and the other actions are lost;"
-            f" {played.early} decisions were answered by an action that was chosen before they"
-            " arose. aec_env loses none, nor does turn_env, for one learner"
-        )
+        problem = "" if episode.round is None else episode.round.explain_losses()
+        if problem and not self._has_warned_of_losses:
+            self._has_warned_of_losses = True
+            warn_user(problem)
 
     def _forget_ended(self) -> None:
         """Forget the records of an episode that has ended."""

@@ -25,9 +25,9 @@ from ..episodes.agent import Agent, Clock
 from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
 from ..episodes.episode import Episode
 from ..episodes.events import PointHandler
-from ..episodes.round import Round
 from ..episodes.session import Session
 from ..episodes.state import EpisodeState, Outcome, State
+from ..episodes.steps import Round
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection

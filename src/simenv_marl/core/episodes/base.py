@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -15,12 +15,13 @@ from ...errors import OptionValueError, SimEnvError, annotate, short_repr
 from ...simulation import Action, Model, Observation
 from ..plans.plan import Plan
 from ..plans.policies import Where
-from ..switching.context import ExclusiveLock
+from ..switching.context import ExclusiveLock, environment_context
 from ..switching.driver import WAIT
 from ..switching.generators import is_seed
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
-from .state import EpisodeState, State
+from .events import Handlers
+from .state import EpisodeState, State, UnmatchedNames
 
 ResetOptions = dict[str, Any] | None
 """The options of a ``reset``."""
@@ -74,6 +75,16 @@ class Replay:
     def answer(self) -> Action:
         """Return the next answer. ``WAIT`` where the other episode stands."""
         return self.answers.popleft() if self.answers else WAIT
+
+
+class EpisodeOwner(Protocol):
+    """The session, as its episodes use it."""
+
+    plan: Plan
+    where: Where
+    handlers: Handlers
+    context: Callable[..., environment_context]
+    unmatched_names: UnmatchedNames
 
 
 @dataclass(eq=False, repr=False, slots=True, weakref_slot=True)

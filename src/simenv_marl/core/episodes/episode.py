@@ -34,10 +34,10 @@ functions run their rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from sys import maxsize
-from typing import Any, Protocol
+from typing import Any
 from weakref import ref
 
 from greenlet import getcurrent
@@ -49,12 +49,10 @@ from ...simulation import (
     RULE,
     TRUNCATED,
     Action,
-    Function,
     Model,
     Sentinel,
     optional_method,
 )
-from ..plans.plan import Plan
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
     AskingPolicy,
@@ -69,23 +67,10 @@ from ..switching.driver import WAIT, AnyHandler, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
-from .base import LONGEST_TAPE, Replay
-from .decision import Decision
-from .events import Handlers
-from .round import Round
+from .base import LONGEST_TAPE, EpisodeOwner, Replay
 from .split import SplitCall
-from .state import RUNNING, EpisodeState, Outcome, UnmatchedNames, checked_actions, missing_decision
-from .team import Team
-
-
-class EpisodeOwner(Protocol):
-    """The session, as its episodes use it."""
-
-    plan: Plan
-    where: Where
-    handlers: Handlers
-    context: Callable[..., environment_context]
-    unmatched_names: UnmatchedNames
+from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
+from .steps import Round, Team
 
 
 class Episode(EpisodeState):
@@ -106,7 +91,7 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_deciders", "_expected_calls", "_failed_in_model", "_handlers",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers",
         "_most_steps", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
         "is_plain", "latest", "memory", "moved", "replay", "running", "session", "simulation",
         "tape",
@@ -140,7 +125,6 @@ class Episode(EpisodeState):
         self._most_steps = plan.options.max_steps or maxsize
         self.memory: dict[object, Any] = {}
         self.moved: set[str] = set()
-        self._deciders = 0
         self._team: Team | None = None
         if plan.options.team_reward is not None:
             self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
@@ -158,12 +142,7 @@ class Episode(EpisodeState):
 
     def handlers_by_hook(self) -> dict[Hook, AnyHandler]:
         """Return the handlers of events: the agent itself where a point has only one."""
-        handlers = dict(self._handlers.by_hook)
-        for agent in self.agents.values():
-            point = agent.point
-            if point.hook in self._handlers.alone:
-                handlers[point.hook] = agent
-        return handlers
+        return self._handlers.with_agents(self.agents.values())
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -337,18 +316,8 @@ class Episode(EpisodeState):
                     self._team.join(agent)
                 return reply
         if self._team is not None:
-            self._settle(self._team, [agent])
+            self.earned = self._team.settle([agent])
         return agent
-
-    @property
-    def total(self) -> float | None:
-        """What the team has earned in the episode. None if each agent has rewards of its own."""
-        return None if self._team is None else self._team.total
-
-    def _settle(self, team: Team, agents: Collection[Agent]) -> None:
-        """Pay agents their share of the team's reward, before a reset or a step returns."""
-        team.settle(agents)
-        self.earned = team.earned
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -448,10 +417,6 @@ class Episode(EpisodeState):
         self.replay = None
         self.just_ended = []
 
-    def decision_of(self, agent: Agent) -> Decision:
-        """Describe the decision of an agent."""
-        return agent.describe(self.seed, self.where)
-
     def planner_view(self) -> object:
         """Make the environment that a planner gets."""
         return self.plan.subject.planner_view(self.session())
@@ -506,11 +471,6 @@ class Episode(EpisodeState):
             self.moved.add(name)
         return agent
 
-    def note_first_decision(self) -> None:
-        """Note that an agent decides for the first time."""
-        self.has_joined = self.has_joined or self.turns > (1 if self.in_rounds else self._deciders)
-        self._deciders += 1
-
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
         self.latest = agent
@@ -520,17 +480,9 @@ class Episode(EpisodeState):
         if self.pending is None and not self.over:
             self.pending = self.latest
 
-    def find(self, name: str) -> Agent | None:
-        """Return an agent, whoever answers it. None if it has not appeared."""
-        return self.agent(name) or self.others.get(name)
-
     def observe_others(self, agent: Agent) -> None:
         """Observe all live agents but one, as when a round returns. Reward none."""
-        expected_calls = self._expected_calls
-        if expected_calls is not None:
-            for other, (args, kwargs) in self._announced(expected_calls, everyone=True).items():
-                if other is not agent:
-                    other.keep(args, kwargs)
+        self._keep_announced(agent, everyone=True)
         for other in (*self.agents.values(), *self.others.values()):
             if other is not agent:
                 other.refresh(reward=False)
@@ -543,11 +495,7 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        expected_calls = self._expected_calls
-        if expected_calls is not None:
-            for agent, (args, kwargs) in self._announced(expected_calls).items():
-                if agent is not pending and (in_rounds or not agent.decided):
-                    agent.keep(args, kwargs)
+        self._keep_announced(pending)
         if truncated:
             self.finish(truncated=True)
             return
@@ -562,18 +510,19 @@ class Episode(EpisodeState):
             if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         if in_rounds and self._team is not None:
-            self._settle(self._team, self.agents.values())
+            self.earned = self._team.settle(self.agents.values())
         self.pending = pending
         self.latest = pending or self.latest
 
-    def _announced(
-        self, expected_calls: Function, *, everyone: bool = False
-    ) -> dict[Agent, tuple[Args, Kwargs]]:
-        """Return the agents that ``expected_calls`` announces, with the arguments of their call.
+    def _keep_announced(self, deciding: Agent | None, *, everyone: bool = False) -> None:
+        """Hold the arguments of the calls that ``expected_calls`` announces, one for each agent.
 
-        ``everyone``: also those that a policy answers.
+        ``everyone``: also for agents that a policy answers.
         """
-        announced: dict[Agent, tuple[Args, Kwargs]] = {}
+        expected_calls = self._expected_calls
+        if expected_calls is None:
+            return
+        known = {deciding}
         for plan_point in self.plan.points if everyone else self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point
@@ -581,9 +530,12 @@ class Episode(EpisodeState):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
                     agent = None if name is None else self.agent_for(handler, name)
-                    if agent is not None and (everyone or not agent.delegated) and not agent.ended:
-                        announced.setdefault(agent, (args, kwargs))
-        return announced
+                    if agent is None or agent in known or agent.ended:
+                        continue
+                    known.add(agent)
+                    is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
+                    if everyone or is_asked:
+                        agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on."""
@@ -655,7 +607,8 @@ class Episode(EpisodeState):
             self.latest = agent
             agent.conclude()
         if self._team is not None:
-            self._settle(self._team, self.agents.values())
+            self.earned = self._team.settle(self.agents.values())
+            self.total = self._team.total
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
         session = self.session()
         if session is not None and (self.plan.named_agents or self.plan.removers):
@@ -690,12 +643,6 @@ class Episode(EpisodeState):
                 f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well",
             )
         clear_frames(error)
-
-    def stop(self) -> None:
-        """Note that nothing happens any more."""
-        self.pending = None
-        if self.outcome is RUNNING:
-            self.outcome = Outcome.STOPPED
 
     def is_suspended(self) -> bool:
         """Return whether the simulation must be unwound before the episode ends.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -260,6 +260,11 @@ class Handlers:
     by_hook: Mapping[Hook, AnyHandler]
     roster: Mapping[str, tuple[PointHandler, Policy, bool]]
     alone: Collection[Hook]
+
+    def with_agents(self, agents: Iterable[Agent]) -> dict[Hook, AnyHandler]:
+        """Return the handlers, with agents in place of those of their points where they can."""
+        own = {agent.point.hook: agent for agent in agents if agent.point.hook in self.alone}
+        return {**self.by_hook, **own}
 
 
 def handlers_of(plan: Plan, simulation: Model) -> Handlers:

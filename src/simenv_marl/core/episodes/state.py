@@ -25,10 +25,11 @@ from ...simulation import RULE, Action
 from ..plans.plan import Plan
 from ..plans.policies import Where
 from ..values.actions import ILLEGAL
-from .round import Round
+from .steps import Round
 
 if TYPE_CHECKING:
     from .agent import Agent, Clock
+    from .decision import Decision
 
 
 class Outcome(Enum):
@@ -163,14 +164,15 @@ class EpisodeState:
         turns: The number of actions that the environment's user has given.
         round: The present round. None if the episode is played in turns.
         earned: The team's reward of the latest step. None if each agent has its own rewards.
+        total: The team's rewards of the whole episode, at its end. None as in ``earned``.
         skips: Whether a decision with one legal action is answered with it.
         where: Where it is played, which determines the policies that are asked.
     """
 
     __slots__ = (
-        "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined", "just_ended",
-        "others", "outcome", "pending", "plan", "round", "seed", "skips", "turns",
-        "unreported_end", "where",
+        "_deciders", "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined",
+        "just_ended", "others", "outcome", "pending", "plan", "round", "seed", "skips", "total",
+        "turns", "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(
@@ -190,7 +192,9 @@ class EpisodeState:
         self.pending: Agent | None = None
         self.consulted: Agent | None = None
         self.outcome = RUNNING
+        self.total: float | None = None
         self.has_joined = False
+        self._deciders = 0
         self.unreported_end = False
         self.turns = 0
         self._fault = ""
@@ -254,9 +258,28 @@ class EpisodeState:
         )
         return is_open and isinstance(name, str)
 
+    def find(self, name: str) -> Agent | None:
+        """Return an agent, whoever answers it. None if it has not appeared."""
+        return self.agent(name) or self.others.get(name)
+
+    def note_first_decision(self) -> None:
+        """Note that an agent decides for the first time."""
+        self.has_joined = self.has_joined or self.turns > (1 if self.in_rounds else self._deciders)
+        self._deciders += 1
+
     def move_to(self, where: Where) -> None:
         """Note that it is played in a clone or a branch from now on."""
         self.where = max(self.where, where)
+
+    def decision_of(self, agent: Agent) -> Decision:
+        """Describe the decision of an agent."""
+        return agent.describe(self.seed, self.where)
+
+    def stop(self) -> None:
+        """Note that nothing happens any more."""
+        self.pending = None
+        if self.outcome is RUNNING:
+            self.outcome = Outcome.STOPPED
 
     def step(self, action: Action) -> None:
         """Answer the pending decision: see ``Episode.step``."""

@@ -240,9 +240,6 @@ class Plan:
 
     unites: bool = False
 
-    _shared: dict[tuple[DecisionPoint, DecisionPoint], bool] = field(
-        init=False, default_factory=dict
-    )
     _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
 
     def derive(self, function: Callable[[Plan], Model]) -> Model:
@@ -284,19 +281,8 @@ class Plan:
         )
 
     def can_share(self, one: Point, other: Point) -> bool:
-        """Return whether an agent may decide at both of two points.
-
-        Their spaces are equal, or no view of agents shows them.
-        """
-        if self.unites or not self.has_user:
-            return True
-        pair = one.hook, other.hook
-        if pair not in self._shared:
-            self._shared[pair] = (
-                one.definition.observation_space == other.definition.observation_space
-                and one.definition.action_space == other.definition.action_space
-            )
-        return self._shared[pair]
+        """Return whether an agent may decide at both of two points."""
+        return self.unites or not self.has_user or one.has_spaces_of(other)
 
     def is_delegated(self, policy: Policy) -> bool:
         """Return whether agents with a policy are no agents of the environment."""

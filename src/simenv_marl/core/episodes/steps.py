@@ -1,13 +1,17 @@
-"""Rounds: in parallel and joint views, a step has an action for each agent."""
+"""What the agents of a step share: the round that is played, and the team's reward."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, Any, Final
 
 from ...errors import short_repr, warn_user
-from ...simulation import RULE, Action
+from ...hooks.stacks import outside_simulation
+from ...plugins import Plugins
+from ...simulation import RULE, Action, Model
 from ..switching.driver import WAIT
 from ..values.actions import mask_allows
+from ..values.rewards import checked_reward
 
 if TYPE_CHECKING:
     from .agent import Agent
@@ -70,6 +74,17 @@ class Round:
         for action in self.actions.values():
             self.unused += action is not RULE
 
+    def explain_losses(self) -> str:
+        """Explain how many actions were lost. Empty if at least nine in ten were used."""
+        if 10 * self.used >= 9 * self.given:
+            return ""
+        return (
+            f"of {self.given} actions in this episode, {self.used} were used: the agents do not"
+            " decide in each round, and the other actions are lost;"
+            f" {self.early} decisions were answered by an action that was chosen before they"
+            " arose. aec_env loses none, nor does turn_env, for one learner"
+        )
+
     def note_moved(self) -> None:
         """Note that the simulation has moved."""
         self.stalled = 0
@@ -83,3 +98,54 @@ class Round:
                 f" {MANY_ROUNDS} rounds in a row had no action for it; the info of the agent that"
                 ' must decide has "deciding": True'
             )
+
+
+class Team:
+    """The team of an episode.
+
+    Attributes:
+        earned: What the team has earned in the latest step. 0.0 at the reset.
+        total: What it has earned since the first decision.
+        plugins: The handlers that take part in its callable.
+        memory: The values of differences in its callable.
+    """
+
+    __slots__ = ("_earn", "_ended", "_has_begun", "_paid", "earned", "memory", "plugins", "total")
+
+    def __init__(self, earn: Callable[[], Model], plugins: Plugins | None) -> None:
+        """Begin without any reward. ``earn`` returns what was earned since it was last called."""
+        self._earn = earn
+        self._ended: list[Agent] = []  # in this step
+        self._has_begun = False
+        self._paid: dict[str, float] = {}  # the total at each agent's latest reward
+        self.earned = 0.0
+        self.total = 0.0
+        self.plugins = plugins
+        self.memory: dict[Any, Any] = {}
+
+    def join(self, agent: Agent) -> None:
+        """Pay an agent for all of this step, because it acts before it was ever paid."""
+        self._paid.setdefault(agent.name, self.total)
+
+    def note_end(self, agent: Agent) -> None:
+        """Note an agent that has ended. It is paid for all of this step."""
+        self._ended.append(agent)
+
+    def settle(self, agents: Collection[Agent]) -> float:
+        """Ask what was earned in this step, and pay agents that have decided, and ended ones.
+
+        The first call is at the reset, before any action, so its value is dropped. Return what was
+        earned.
+        """
+        with outside_simulation(self):
+            earned = checked_reward("the team", self._earn())
+        if self._has_begun:
+            self.earned = earned
+            self.total += earned
+        self._has_begun = True
+        for agent in (*self._ended, *agents):
+            if agent.decided:
+                agent.pay(self.total - self._paid.get(agent.name, self.total))
+                self._paid[agent.name] = self.total
+        self._ended = []
+        return self.earned

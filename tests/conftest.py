@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from simenv_marl.core.plans.options import Options
+from simenv_marl.core.switching import opened
 
 # Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
 settings.register_profile(
@@ -94,6 +95,8 @@ def pytest_runtest_protocol(item, nextitem):
     if nextitem is None or nextitem.path != item.path:
         gc.collect()
         gc.freeze()
+        # Forks find event loops among what is not frozen, and refuse epoll objects without a loop.
+        opened._EPOLLS_BEFORE.update(opened.new_epolls())
     return result
 
 

@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 import warnings
-from contextlib import contextmanager
 from functools import cached_property
 from queue import SimpleQueue
 
@@ -65,19 +64,6 @@ class Counts(Model):
 
     def work(self):
         with self.lock:
-            self.decide()
-
-
-class Guards(Model):
-    """A lock that the frames of the suspended simulation do not show."""
-
-    @contextmanager
-    def guard(self):
-        with self.lock:
-            yield
-
-    def work(self):
-        with self.guard():
             self.decide()
 
 
@@ -153,7 +139,6 @@ def begin(model, driver, envs):
         (Counts, Counts),
         (Fills, Enters),
         (Fills, Synchronizes),
-        pytest.param(Guards, Guards, marks=pytest.mark.skipif(not LISTED, reason=NOT_LISTED)),
         pytest.param(Caches, Caches, marks=pytest.mark.skipif(not ONE_LOCK, reason="has no lock")),
     ],
 )

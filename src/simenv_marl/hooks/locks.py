@@ -9,7 +9,6 @@ another thread watches while there are at least two simulations.
 from __future__ import annotations
 
 import os
-import re
 import signal
 import sys
 from _thread import start_new_thread
@@ -17,8 +16,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dis import get_instructions
 from inspect import getattr_static
-from pathlib import Path
-from threading import Event, Semaphore, get_native_id, main_thread
+from threading import Event, Semaphore, main_thread
 from traceback import format_stack, walk_stack
 from types import FrameType
 from typing import Any, Final
@@ -40,25 +38,6 @@ _told: Final[set[str]] = set()
 _stops: Final[list[Semaphore | None]] = []
 """Ends the watching thread. Empty if there is none. None: there must be none."""
 
-_FOREVER: Final = re.compile(r"futex\w+ \w+ 0x\w*[89a-f]\w \w+ 0x0 ")
-"""A wait without a time limit for private memory (a futex), which only its process can end."""
-
-
-def waits_of(process: int) -> list[str]:
-    """Return where all threads of a process wait, but for the current thread.
-
-    An empty list if one of them may go on.
-    """
-    with suppress(OSError):  # it has ended, or the system hides it
-        waits = [
-            "".join((task / name).read_text() for name in ("wchan", "syscall", "status"))
-            for task in Path(f"/proc/{process}/task").iterdir()
-            if task.name != str(get_native_id())
-        ]
-        if all(map(_FOREVER.match, waits)):
-            return waits  # with the status, which counts how often they have run
-    return []
-
 
 def explain_wait(running: FrameType, user: int) -> str | None:
     """Explain why a simulation does not go on, if it waits for a lock of a suspended one.
@@ -70,9 +49,9 @@ def explain_wait(running: FrameType, user: int) -> str | None:
         running: The innermost frame of the simulation that may wait.
         user: The number of its user's thread.
     """
-    for waiting, holds, holding, driver in _candidates(running):
+    for waiting, holding, driver in _candidates(running):
         text = (
-            f"{_describe(waiting)} waits for a lock that {_describe(holding)} {holds} while it is"
+            f"{_describe(waiting)} waits for a lock that {_describe(holding)} holds while it is"
             " suspended at a decision. Release locks before decisions, or give each simulation a"
             " lock of its own; another driver does not help\n"
             f"{''.join(format_stack(running))}The other simulation:\n"
@@ -87,18 +66,15 @@ def explain_wait(running: FrameType, user: int) -> str | None:
     return None
 
 
-def _candidates(running: FrameType) -> Iterator[tuple[FrameType, str, FrameType, Any]]:
-    """Yield a frame that waits for a lock, a verb, and the frame and the driver that hold it."""
-    drivers = [d for d in STACKS.values() if d and d.frame and not d.idle]
+def _candidates(running: FrameType) -> Iterator[tuple[FrameType, FrameType, Any]]:
+    """Yield a frame that waits for a lock, and the frame and the driver that hold it."""
+    drivers = [driver for driver in STACKS.values() if driver and driver.frame and not driver.idle]
     for waiting, _ in walk_stack(running):
         lock = _locks_of(waiting, waits=True)[-1]
         for driver in drivers if hasattr(lock, "acquire") else ():
             for holding, _ in walk_stack(driver.frame):
                 if any(lock is other for other in _locks_of(holding)):
-                    yield waiting, "holds", holding, driver
-    if waits_of(os.getpid()):  # then nothing else can release the lock
-        for driver in drivers:
-            yield running, "seems to hold", driver.frame, driver
+                    yield waiting, holding, driver
 
 
 def _describe(frame: FrameType) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]  # without the enums of signal, which forks copy
 import os
+import re
 import select
 import socket
 import sys
@@ -18,10 +19,11 @@ from functools import partial
 from math import inf
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Final, TypeVar
 
 from ...errors import BranchError, annotate
-from ...hooks.locks import waits_of, watch_no_locks
+from ...hooks.locks import watch_no_locks
 from ...simulation import Model
 from ..switching.context import ExclusiveLock
 from .packing import unpack_outcome
@@ -110,6 +112,9 @@ def _end_with(descriptor: int) -> None:
 
 
 # -- forks ----------------------------------------------------------------------------------------
+
+_FOREVER: Final = re.compile(r"futex\w+ \w+ 0x\w*[89a-f]\w \w+ 0x0 ")
+"""A wait without a time limit for private memory (a futex), which only its process can end."""
 
 PATIENCE: Final = 2.0
 """After so many seconds without a response, look whether the process can still respond."""
@@ -225,7 +230,7 @@ class Fork(Peer):
     def is_stuck(self) -> bool:
         """Return whether all threads wait for locks, and did so at the previous call."""
         before = self._waits
-        self._waits = waits_of(self.process)
+        self._waits = _waits_of(self.process)
         return before == self._waits != []
 
     @contextmanager
@@ -304,6 +309,18 @@ def _wait_for(served: object, process: int, options: int = 0) -> None:
     """
     with suppress(ChildProcessError):
         os.waitpid(process, options)
+
+
+def _waits_of(process: int) -> list[str]:
+    """Return where the threads of a process wait. An empty list if one of them may go on."""
+    with suppress(OSError):  # it has ended, or the system hides it
+        waits = [
+            "".join((task / name).read_text() for name in ("wchan", "syscall", "status"))
+            for task in Path(f"/proc/{process}/task").iterdir()
+        ]
+        if all(map(_FOREVER.match, waits)):
+            return waits  # with the status, which counts how often they have run
+    return []
 
 
 def fork(connection: Connection, first: Callable[[], Result]) -> int | Result:

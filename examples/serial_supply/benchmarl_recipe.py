@@ -11,6 +11,7 @@ from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
+import numpy as np
 import torch
 from benchmarl.algorithms import MappoConfig, QmixConfig, VdnConfig
 from benchmarl.environments.pettingzoo.common import PettingZooClass
@@ -22,7 +23,7 @@ from torchrl.envs import ExplorationType, PettingZooWrapper, set_exploration_typ
 from simenv_marl import parallel_env
 
 from .command import Policies, command
-from .env import DISCRETE, OPTIONS, PERIODS, STAGES, SerialSupply, profit
+from .env import DISCRETE, OPTIONS, PERIODS, QUANTITIES, STAGES, SerialSupply, profit
 
 ALGORITHMS: Final = {"mappo": MappoConfig, "qmix": QmixConfig, "vdn": VdnConfig}
 
@@ -85,13 +86,15 @@ def train(seed: int, steps: int = STEPS, *, algorithm: str = "mappo") -> Policie
 
 def single(policy: Any, stage: int) -> Any:
     """Make a policy of one stage, which takes one observation or a stack of them."""
+    quantities = np.array(QUANTITIES, np.float32)
 
     def decide(observation: Any) -> Any:
         rows = torch.as_tensor(observation).unsqueeze(-2)
         rows = rows.expand(*rows.shape[:-2], len(STAGES), -1)  # the network takes all stages
         seen = TensorDict({"stages": {"observation": rows}}, rows.shape[:-2])
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            return policy(seen)["stages", "action"].select(rows.ndim - 2, stage).numpy()
+            found = policy(seen)["stages", "action"].select(rows.ndim - 2, stage).numpy()
+        return found if found.dtype == np.float32 else quantities[found][..., None]
 
     return decide
 

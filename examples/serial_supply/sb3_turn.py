@@ -19,7 +19,7 @@ from simenv_marl.data import turn_policy
 from .command import Policies, command
 from .env import OPTIONS, SerialSupply, profit
 
-STEPS: Final = 300_000
+STEPS: Final = 240_000
 """The number of decisions: three in each period."""
 
 # -- glue: begin ----------------------------------------------------------------------------------
@@ -36,11 +36,11 @@ def train(seed: int, steps: int = STEPS) -> Policies:
     learner = PPO(
         "MlpPolicy",
         make_vec_env(make, n_envs=8),
-        n_steps=300,
-        batch_size=300,
+        n_steps=600,
+        batch_size=200,
         gamma=0.95,
-        gae_lambda=0.8,
-        learning_rate=lambda left: 2e-3 * left,
+        gae_lambda=0.9,
+        learning_rate=lambda left: 1e-3 * left,
         policy_kwargs={"log_std_init": -1.5},
         seed=seed,
     )

@@ -55,6 +55,9 @@ OPTIMAL: Final = (6.48, 12.03, 22.72)
 OPTIMUM: Final = 47.665
 """The expected cost of a period with optimal base stocks."""
 
+FIRST_STOCKS: Final = (6.48, 5.55, 10.69)
+"""The first stocks: the optimal base stocks, as local ones, so that episodes begin calmly."""
+
 MOST: Final = 2 * DEMAND
 """The largest order."""
 
@@ -76,12 +79,12 @@ class SerialSupply(SimulationInterface):
     points: ClassVar[Mapping[Any, Definition]]
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin with the stock that stockpyl itself would begin with."""
+        """Begin with the optimal stocks."""
         self.network: Any = load_instance("example_6_1")
         self.nodes = [self.network.nodes_by_index[number] for number in range(1, len(STAGES) + 1)]
-        for node, level in zip(self.nodes, RULE_LEVELS, strict=True):
+        for node, level, stock in zip(self.nodes, RULE_LEVELS, FIRST_STOCKS, strict=True):
             node.inventory_policy.base_stock_level = level
-            node.initial_inventory_level = level  # else stockpyl asks the policy for it
+            node.initial_inventory_level = stock  # else stockpyl asks the policy for it
         self._seed = seed
 
     def run(self) -> Any:

@@ -23,7 +23,7 @@ from .env import OPTIONS, STAGES, SerialSupply, profit
 STEPS: Final = 80_000
 """The number of periods."""
 
-BATCH, MINIBATCH, EPOCHS = 800, 100, 10
+BATCH, MINIBATCH, EPOCHS = 1600, 100, 10
 
 
 def train(seed: int, steps: int = STEPS) -> Policies:

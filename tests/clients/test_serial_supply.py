@@ -12,6 +12,7 @@ pytest.importorskip("stockpyl")
 from examples.serial_supply.command import cost
 from examples.serial_supply.env import (
     DISCRETE,
+    FIRST_STOCKS,
     OPTIMUM,
     OPTIONS,
     PERIODS,
@@ -50,8 +51,10 @@ GLUE = 60
 def plain(seed):
     """The cost of stockpyl's own run, without any environment."""
     network = load_instance("example_6_1")
-    for number, level in enumerate(RULE_LEVELS, start=1):
-        network.nodes_by_index[number].inventory_policy.base_stock_level = level
+    for number, stock in enumerate(FIRST_STOCKS):
+        node = network.nodes_by_index[number + 1]
+        node.inventory_policy.base_stock_level = RULE_LEVELS[number]
+        node.initial_inventory_level = stock
     return simulation(network, PERIODS, rand_seed=seed, progress_bar=False, consistency_checks="N")
 
 

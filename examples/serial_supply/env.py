@@ -16,7 +16,7 @@ these levels, and ``OPTIMUM`` their long-run cost per period.
 not depend on the orders of the same period. So a stage sees the same in all views.
 
 **Rewards.** A stage's own costs since its previous decision. The option ``team_reward=profit``
-rewards the costs of the whole chain instead. Both are in units of ``OPTIMUM``.
+rewards the costs of the whole chain instead. Both are in units of ``UNIT``.
 """
 
 from __future__ import annotations
@@ -57,6 +57,9 @@ OPTIMUM: Final = 47.665
 
 FIRST_STOCKS: Final = (6.48, 5.55, 10.69)
 """The first stocks: the optimal base stocks, as local ones, so that episodes begin calmly."""
+
+UNIT: Final = 250.0
+"""The unit of rewards: with it, the values that learners estimate are about 1."""
 
 MOST: Final = 2 * DEMAND
 """The largest order."""
@@ -153,7 +156,7 @@ def look(policy: Policy, *, _simulation: SerialSupply) -> NDArray[np.float32]:
     return seen.clip(-FARTHEST, FARTHEST)
 
 
-_own = difference(lambda policy, _simulation: -_simulation.cost_of(policy.node.index - 1) / OPTIMUM)
+_own = difference(lambda policy, _simulation: -_simulation.cost_of(policy.node.index - 1) / UNIT)
 
 
 def own_costs(policy: Policy, *, _simulation: SerialSupply) -> float:
@@ -187,7 +190,7 @@ SerialSupply.points = {POINT: order}
 OPTIONS: Final[dict[str, Any]] = {"possible_agents": STAGES, "global_rng": True}
 """Options of all environments: stockpyl draws from NumPy's global generator."""
 
-profit = difference(lambda chain: -chain.cost / OPTIMUM)
+profit = difference(lambda chain: -chain.cost / UNIT)
 """The reward of the team, for the option ``team_reward``."""
 
 DISCRETE: Final = {POINT: few_orders}

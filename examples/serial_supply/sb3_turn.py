@@ -19,7 +19,7 @@ from simenv_marl.data import turn_policy
 from .command import Policies, command
 from .env import OPTIONS, SerialSupply, profit
 
-STEPS: Final = 240_000
+STEPS: Final = 400_000
 """The number of decisions: three in each period."""
 
 # -- glue: begin ----------------------------------------------------------------------------------
@@ -40,7 +40,7 @@ def train(seed: int, steps: int = STEPS) -> Policies:
         batch_size=200,
         gamma=0.95,
         gae_lambda=0.9,
-        learning_rate=lambda left: 1e-3 * left,
+        learning_rate=lambda left: 2e-3 * left,
         policy_kwargs={"log_std_init": -1.5},
         seed=seed,
     )

@@ -20,7 +20,7 @@ from simenv_marl import parallel_env
 from .command import Policies, command
 from .env import OPTIONS, STAGES, SerialSupply, profit
 
-STEPS: Final = 80_000
+STEPS: Final = 64_000
 """The number of periods."""
 
 BATCH, MINIBATCH, EPOCHS = 1600, 100, 10
@@ -66,7 +66,7 @@ def learn(env: Any, seed: int, steps: int, *, central: bool) -> Policies:
     names = ("action", "reward", "done", "terminated")
     loss.set_keys(value=("stages", "state_value"), **{name: ("stages", name) for name in names})
     loss.make_value_estimator(gamma=0.9, lmbda=0.9)  # GAE
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, max(1, steps // BATCH))
     for data in Collector(env, policy, frames_per_batch=BATCH, total_frames=steps):
         with torch.no_grad():

@@ -18,6 +18,7 @@ from examples.serial_supply.env import (
     PERIODS,
     RULE_LEVELS,
     STAGES,
+    UNIT,
     SerialSupply,
     base_stocks,
     profit,
@@ -109,7 +110,7 @@ def test_rewards_of_the_team_add_up_to_the_costs():
     while not over:
         _, reward, _, over, _ = env.step(RULE)
         gained += reward
-    assert gained == pytest.approx(-env.unwrapped.simulation.cost / OPTIMUM)
+    assert gained == pytest.approx(-env.unwrapped.simulation.cost / UNIT)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

@@ -12,6 +12,10 @@ these levels, and ``OPTIMUM`` their long-run cost per period.
 
 **Rule.** Each stage orders up to the mean demand of its lead time, so it has no safety stock.
 
+**Orders.** A stage has room for twice the mean demand of its lead time, and orders no more than it
+has room for. Without this limit, stage 1 may learn to order far too much: it costs nothing to be
+owed goods, and smaller orders then change nothing for a long time.
+
 **Observations.** Five numbers for each stage, all in periods of mean demand (see ``look``). They do
 not depend on the orders of the same period. So a stage sees the same in all views.
 
@@ -63,6 +67,9 @@ UNIT: Final = 250.0
 
 MOST: Final = 2 * DEMAND
 """The largest order."""
+
+ROOM: Final = tuple(2 * level for level in RULE_LEVELS)
+"""The largest local position of each stage."""
 
 QUANTITIES: Final = tuple(number / 2 for number in range(21))
 """The orders of ``few_orders``."""
@@ -164,12 +171,18 @@ def own_costs(policy: Policy, *, _simulation: SerialSupply) -> float:
     return float(_own(policy, _simulation))
 
 
+def place(action: Any, policy: Policy, position: float) -> float:
+    """Return the quantity that a stage orders: as much as it wants and has room for."""
+    room = ROOM[policy.node.index - 1] - position
+    return max(0.0, min(float(np.ravel(action)[0]), room))
+
+
 order = make_step(
     agent=lambda policy: STAGES[policy.node.index - 1],
     observation_space=Box(-FARTHEST, FARTHEST, (5,), np.float32),
     observation_space_mapping=look,
     action_space=Box(0.0, MOST, (1,), np.float32),
-    action_space_mapping=lambda action: float(np.ravel(action)[0]),
+    apply=place,
     reward_mapping=own_costs,
     rule_action_mapping=lambda quantity: [min(quantity, MOST)],
 )
@@ -178,7 +191,7 @@ order = make_step(
 few_orders = replace(
     order,
     action_space=Discrete(len(QUANTITIES)),
-    action_space_mapping=QUANTITIES.__getitem__,
+    apply=lambda action, policy, position: place(QUANTITIES[action], policy, position),
     rule_action_mapping=lambda quantity: min(round(2 * quantity), len(QUANTITIES) - 1),
 )
 """The same in steps of half a unit, for learners of discrete actions."""

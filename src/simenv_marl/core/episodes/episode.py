@@ -87,6 +87,9 @@ class EpisodeOwner(Protocol):
     context: Callable[..., environment_context]
     unmatched_names: UnmatchedNames
 
+    def read_state(self) -> Model:
+        """Return the state of the simulation."""
+
 
 class Episode(EpisodeState):
     """One run of a simulation, from its reset to its end. It does not refer to the environment.
@@ -105,9 +108,10 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps", "_plugins",
-        "_split", "_tape_size", "_team", "called", "driver", "is_plain", "latest", "memory",
-        "replay", "running", "session", "simulation", "tape",
+        "_context", "_end_states", "_expected_calls", "_failed_in_model", "_handlers",
+        "_most_steps", "_noted", "_observes", "_plugins", "_split", "_tape_size", "_team",
+        "called", "driver", "is_plain", "latest", "memory", "replay", "running", "session",
+        "simulation", "tape",
     )  # fmt: skip
 
     def __init__(
@@ -145,6 +149,11 @@ class Episode(EpisodeState):
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
+        self._noted: tuple[int, Model] | None = None  # the turn of the latest state, and the state
+        self._observes = isinstance(
+            plan.options.state_space, str
+        )  # whether observations are states
+        self._end_states: dict[Agent, Model] | None = None
         for name, prepared in self._handlers.roster.items():
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
@@ -391,7 +400,7 @@ class Episode(EpisodeState):
             reply = agent.reply_if_forced()
             if reply is not agent:
                 return reply
-        if isinstance(policy, EpisodePolicy) and policy.looks_back:
+        if self._observes or (isinstance(policy, EpisodePolicy) and policy.looks_back):
             agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
@@ -564,16 +573,52 @@ class Episode(EpisodeState):
         return announced
 
     def end_agent(self, agent: Agent) -> None:
-        """End the episode of one agent while the simulation's goes on."""
+        """End the episode of one agent while the simulation's goes on.
+
+        An agent that is none of the environment is observed for the last time, if states need it.
+        """
+        is_other = agent.delegated
+        if is_other and not self._observes:
+            return
         latest = self.latest
         self.latest = agent
         agent.conclude()
-        agent.end()
+        if self._end_states is not None:
+            self._end_states[agent] = self.read_state()
         self.latest = latest  # the model continues after the decision of this agent
+        if is_other:
+            return
+        agent.end()
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
         if self._team is not None:
             self._team.note_end(agent)
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation: see ``StateReader``."""
+        session: Any = self.session()
+        return session.read_state()
+
+    def note_state(self, *, keeps_ends: bool = False) -> Model:
+        """Return the state at the pending decision, or at the end. It is read once.
+
+        ``keeps_ends``: whether to keep the states at later ends of agents, too.
+        """
+        if self.is_branch:  # policies answer here, and ``turns`` stays
+            return self.read_state()
+        if keeps_ends and self._end_states is None:
+            self._end_states = {}
+        if self._noted is None or self._noted[0] != self.turns:
+            try:
+                self._noted = self.turns, self.read_state()
+            except BaseException as error:
+                self.annotate(error)
+                raise
+        return self._noted[1]
+
+    def take_end_state(self, agent: Agent) -> Model:
+        """Return the state at the end of an agent, and forget it. None if it was not kept."""
+        return self._end_states.pop(agent, None) if self._end_states else None
 
     # -- branches that wait for one agent ---------------------------------------------------------
 

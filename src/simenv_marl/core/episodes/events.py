@@ -135,7 +135,7 @@ class RemovalHandler(Observer):
                 name = _name_of_entity(episode, handler, owner, args)
             named.append((handler, name))
         for handler, name in named:
-            agent = episode.agents.get(name)
+            agent = episode.agents.get(name) or episode.others.get(name)
             if agent is not None and handler in (None, agent.handler):
                 episode.end_agent(agent)
             elif handler is None and name is not None and not self._has_warned:

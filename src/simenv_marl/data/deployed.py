@@ -12,14 +12,16 @@ from ..core import (
     MASK,
     Action,
     Agent,
+    Caller,
     Episode,
     EpisodePolicy,
     Info,
     Observation,
     Plan,
+    is_asked_alone,
     split_batch,
     stacker,
-    two_arguments,
+    takes_state,
 )
 from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..envs.base import OneAgentView
@@ -96,15 +98,24 @@ class _Deployed(EpisodePolicy):
     """A learner's policy for all agents."""
 
     def __init__(self, predict: Predict, plan: Plan) -> None:
+        if is_asked_alone(predict):
+            raise OptionValueError(
+                f"{short_repr(predict)} must answer at once, and can ask for _state alone, not for"
+                " _environment or _decision"
+            )
         self.policy = predict
+        self.takes_state = takes_state(predict)
+        self._call = Caller(predict)
         self._plan = plan
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.policy, self._plan)
 
-    def _ask(self, observation: Observation, info: Info, space: Any) -> tuple[Action, Any]:
+    def _ask(
+        self, observation: Observation, info: Info, space: Any, state: object
+    ) -> tuple[Action, Any]:
         """Ask for an action in a space; return it, and the extras."""
-        answer = two_arguments(self.policy)(observation, info)
+        answer = self._call(observation, info, {"_state": state})
         has_extras = isinstance(answer, tuple) and not isinstance(space, spaces.Tuple)
         action, extras = answer if has_extras else (answer, {})
         return action, extras if isinstance(extras, Mapping) else {}
@@ -129,10 +140,14 @@ class TurnPolicy(_Deployed):
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the action and the extras."""
         seen = self._turn.observe(agent)
-        action, extras = self._ask(seen, self._info(agent, info), self._turn.action_space)
+        state = episode.read_state() if self.takes_state else None
+        told = self._info(agent, info)
+        action, extras = self._ask(seen, told, self._turn.action_space, state)
         return self._own(agent, action), extras
 
-    def respond_to_many(self, agents: Sequence[Agent], infos: Sequence[Info]) -> Action:
+    def respond_to_many(
+        self, agents: Sequence[Agent], infos: Sequence[Info], states: object
+    ) -> Action:
         """Answer many decisions at once with the actions and the extras."""
         stack = stacker(self._turn.observation_space, cast=True)
         seen = stack([self._turn.observe(agent) for agent in agents])
@@ -140,7 +155,7 @@ class TurnPolicy(_Deployed):
         if self._turn.has_masks:
             masks: list[Any] = [self._turn.mask(agent) for agent in agents]
             told[MASK] = np.stack(masks)
-        answers, extras = self._ask(seen, told, self._turn.action_space)
+        answers, extras = self._ask(seen, told, self._turn.action_space, states)
         actions = split_batch(answers, integers=True)
         if actions is None or len(actions) != len(agents):
             raise InvalidActionError(
@@ -192,7 +207,8 @@ class JointPolicy(_Deployed):
         unused = episode.memory.get(self, found)
         told["deciding"] = deciding.name
         told["acted"] = {name: name not in unused for name in found}
-        answer, _ = self._ask(seen, told, self._joint.action_space)
+        state = episode.read_state() if self.takes_state else None
+        answer, _ = self._ask(seen, told, self._joint.action_space, state)
         live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
         actions = self._joint.actions(live, answer)
         episode.memory[self] = actions

@@ -33,9 +33,9 @@ from ..core import (
     Point,
     Session,
     Space,
+    StateReader,
     checked_seed,
     describe,
-    observation_cast,
     pack,
     unpack,
 )
@@ -217,24 +217,10 @@ class View:
     # -- the state --------------------------------------------------------------------------------
 
     @cached_property
-    def _all_observations(self) -> Space:
-        """The space of the observations of all possible agents."""
-        points = self._roster.values()
-        return spaces.Tuple([point.definition.observation_space for point in points])
-
-    @cached_property
     def state_space(self) -> Space | None:
         """The space of ``state()``, if the environment was made with one."""
-        space = self.session.plan.options.state_space
-        if not isinstance(space, str):
-            return space
-        flat = spaces.flatten_space(self._all_observations)
-        if not isinstance(flat, spaces.Box):
-            raise ViewError(
-                'state_space="observations" needs spaces that can be flattened, not'
-                f" {self._all_observations}"
-            )
-        return flat
+        reader: StateReader = self.session.plan.derive(StateReader)
+        return reader.space
 
     def state(self) -> Model:
         """Return the state of the simulation, for centralised critics.
@@ -250,17 +236,7 @@ class View:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
-        if isinstance(self.session.plan.options.state_space, str):
-            observations = [
-                agent.point.blank() if agent.observation is None else agent.observation
-                for agent in self.known_agents()
-            ]
-            value = spaces.flatten(self._all_observations, tuple(observations))
-        else:
-            value = self.session.ask("state")
-        if self.state_space is None:
-            return np.array(value)
-        return observation_cast(self.state_space)(value)
+        return self.session.read_state()
 
     # -- episodes ---------------------------------------------------------------------------------
 

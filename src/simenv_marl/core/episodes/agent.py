@@ -238,6 +238,11 @@ class Agent:
             " when its entity is gone"
         )
 
+    @property
+    def place(self) -> str:
+        """Its name and its decision point, for the notes of errors."""
+        return f"of {self.name!r} at {self.point.hook.name}"
+
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision: see ``Point.validate``."""
         return self.point.validate(action, self.name, self.mask)

@@ -1,13 +1,5 @@
 """One episode of one simulation: the order of events.
 
-An episode::
-
-    MOVING <--------> PENDING --------> OVER
-    the simulation    a decision waits  terminated, truncated,
-    runs, or          for the user      failed or closed
-    mappings and
-    policies do
-
 A decision::
 
     simulation                     episode, on its user's stack
@@ -45,14 +37,7 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import (
-    RULE,
-    TRUNCATED,
-    Action,
-    Model,
-    Sentinel,
-    optional_method,
-)
+from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
     AskingPolicy,
@@ -63,14 +48,14 @@ from ..plans.policies import (
     two_arguments,
 )
 from ..switching.context import environment_context
-from ..switching.driver import WAIT, AnyHandler, Driver, Event
+from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
 from .base import LONGEST_TAPE, EpisodeOwner, Replay
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
-from .steps import Round, Team
+from .steps import Round, StateNotes, Team
 
 
 class Episode(EpisodeState):
@@ -86,15 +71,16 @@ class Episode(EpisodeState):
         is_plain: Whether a decision of the user's agents is just updated, and waits.
         memory: The values of policies for all agents.
         moved: The names of agents that have decided at several points.
+        states: The states that learners have asked for. None if none has.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
         replay: The policy that repeats another episode. None in ordinary episodes.
     """
 
     __slots__ = (
-        "_context", "_expected_calls", "_failed_in_model", "_handlers",
-        "_most_steps", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps",
+        "_observes", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
         "is_plain", "latest", "memory", "moved", "replay", "running", "session", "simulation",
-        "tape",
+        "states", "tape",
     )  # fmt: skip
 
     def __init__(
@@ -133,16 +119,14 @@ class Episode(EpisodeState):
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
+        self._observes = isinstance(plan.options.state_space, str)  # observations are states
+        self.states: StateNotes | None = None
         for name, prepared in self._handlers.roster.items():
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
     def context(self) -> environment_context:
         """Return the context that the environment's code needs."""
         return self._context(self.driver)
-
-    def handlers_by_hook(self) -> dict[Hook, AnyHandler]:
-        """Return the handlers of events: the agent itself where a point has only one."""
-        return self._handlers.with_agents(self.agents.values())
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -372,7 +356,7 @@ class Episode(EpisodeState):
             reply = agent.reply_if_forced()
             if reply is not agent:
                 return reply
-        if isinstance(policy, EpisodePolicy) and policy.looks_back:
+        if self._observes or (isinstance(policy, EpisodePolicy) and policy.looks_back):
             agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
@@ -439,11 +423,6 @@ class Episode(EpisodeState):
 
     # -- agents -----------------------------------------------------------------------------------
 
-    def _make_agent(self, name: str, handler: DecisionHandler) -> Agent:
-        policy = self.plan.policy_of(name, handler.point)
-        delegated = self.plan.is_delegated(policy)
-        return Agent(name, handler, policy, delegated, self.clock, self._plugins)
-
     def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point. Let a new one join.
 
@@ -457,8 +436,10 @@ class Episode(EpisodeState):
             )
         agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
         if agent is None:
-            agent = self._make_agent(name, handler)
-            (self.others if agent.delegated else self.agents)[name] = agent
+            policy = self.plan.policy_of(name, handler.point)
+            delegated = self.plan.is_delegated(policy)
+            agent = Agent(name, handler, policy, delegated, self.clock, self._plugins)
+            (self.others if delegated else self.agents)[name] = agent
         elif agent.handler is not handler:
             policy = self.plan.policy_of(name, handler.point)
             if policy is not agent.policy or not self.plan.can_share(agent.point, handler.point):
@@ -538,16 +519,37 @@ class Episode(EpisodeState):
                         agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
-        """End the episode of one agent while the simulation's goes on."""
+        """End the episode of one agent while the simulation's goes on.
+
+        An agent that is none of the environment is observed for the last time, if states need it.
+        """
+        is_other = agent.delegated
+        if is_other and not self._observes:
+            return
         latest = self.latest
         self.latest = agent
         agent.conclude()
-        agent.end()
+        if self.states is not None:
+            self.states.note_end(agent)
         self.latest = latest  # the model continues after the decision of this agent
+        if is_other:
+            return
+        agent.end()
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
         if self._team is not None:
             self._team.note_end(agent)
+
+    def note_states(self) -> StateNotes:
+        """Return the states that learners ask for, and note further ones."""
+        if self.states is None:
+            self.states = StateNotes(self)
+        return self.states
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation: see ``StateReader``."""
+        session: Any = self.session()
+        return session.read_state()
 
     # -- branches that wait for one agent ---------------------------------------------------------
 
@@ -622,9 +624,9 @@ class Episode(EpisodeState):
         if agent is None:
             where = "before the first decision"
         elif self._failed_in_model:
-            where = f"in the model, after decision {self.turns}, {_at(agent)}"
+            where = f"in the model, after decision {self.turns}, {agent.place}"
         else:
-            where = f"at decision {self.turns + 1}, {_at(agent)}"
+            where = f"at decision {self.turns + 1}, {agent.place}"
         annotate(error, f"simenv_marl: {where}; seed {self.seed}")
 
     def fail(self, error: BaseException) -> None:
@@ -691,7 +693,3 @@ class Episode(EpisodeState):
             self._fault = f"{type(self.simulation).__name__} {self.driver.given_up}."
             warn_user(self._fault, ResourceWarning)
         return problems
-
-
-def _at(agent: Agent) -> str:
-    return f"of {agent.name!r} at {agent.point.hook.name}"

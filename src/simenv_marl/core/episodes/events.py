@@ -135,7 +135,7 @@ class RemovalHandler(Observer):
                 name = _name_of_entity(episode, handler, owner, args)
             named.append((handler, name))
         for handler, name in named:
-            agent = episode.agents.get(name)
+            agent = episode.agents.get(name) or episode.others.get(name)
             is_its_own = agent is not None and handler in (None, agent.handler)
             if agent is not None and (is_its_own or name in episode.moved):
                 episode.end_agent(agent)

@@ -261,7 +261,7 @@ class Session(BaseSession):
         self.episode = episode = Episode(
             self, simulation, clock, self._driver, seed, replay, in_rounds=in_rounds
         )
-        return simulation.run, episode.handlers_by_hook()
+        return simulation.run, self.handlers.with_agents(episode.agents.values())
 
     def _make_clock(self) -> Clock | None:
         """Make the clock of the simulation. None if it has no time."""

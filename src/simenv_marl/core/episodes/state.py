@@ -1,4 +1,13 @@
-"""The state of an episode, as views and clones read it."""
+"""The state of an episode, as views and clones read it.
+
+An episode::
+
+    MOVING <--------> PENDING --------> OVER
+    the simulation    a decision waits  terminated, truncated,
+    runs, or          for the user      failed or closed
+    mappings and
+    policies do
+"""
 
 from __future__ import annotations
 

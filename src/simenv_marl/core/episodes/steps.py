@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from ...errors import short_repr, warn_user
 from ...hooks.stacks import outside_simulation
@@ -100,6 +100,22 @@ class Round:
             )
 
 
+class NotedEpisode(Protocol):
+    """An episode whose states are noted."""
+
+    turns: int
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch that a policy has made of its environment."""
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation."""
+
+    def annotate(self, error: BaseException) -> None:
+        """Add a note to an error: the decision and the agent where it arose."""
+
+
 class Team:
     """The team of an episode.
 
@@ -149,3 +165,33 @@ class Team:
                 self._paid[agent.name] = self.total
         self._ended = []
         return self.earned
+
+
+class StateNotes:
+    """The states of an episode that learners ask for. Each is read once.
+
+    Attributes:
+        ends: The state at the end of each agent that has ended midway, until it is taken.
+    """
+
+    def __init__(self, episode: NotedEpisode) -> None:
+        self._episode = episode
+        self._latest: tuple[int, Model] | None = None  # the turn, and the state
+        self.ends: dict[Agent, Model] = {}
+
+    def read(self) -> Model:
+        """Return the state at the pending decision, or at the end."""
+        episode = self._episode
+        if episode.is_branch:  # policies answer here, and ``turns`` stays
+            return episode.read_state()
+        if self._latest is None or self._latest[0] != episode.turns:
+            try:
+                self._latest = episode.turns, episode.read_state()
+            except BaseException as error:
+                episode.annotate(error)
+                raise
+        return self._latest[1]
+
+    def note_end(self, agent: Agent) -> None:
+        """Note the state at the end of an agent."""
+        self.ends[agent] = self._episode.read_state()

@@ -27,7 +27,7 @@ from .env import DISCRETE, OPTIONS, PERIODS, QUANTITIES, STAGES, SerialSupply, p
 
 ALGORITHMS: Final = {"mappo": MappoConfig, "qmix": QmixConfig, "vdn": VdnConfig}
 
-STEPS: Final = 80_000
+STEPS: Final = 64_000
 """The number of periods."""
 
 # -- glue: begin ----------------------------------------------------------------------------------
@@ -65,8 +65,8 @@ def train(seed: int, steps: int = STEPS, *, algorithm: str = "mappo") -> Policie
     config = ExperimentConfig.get_from_yaml()
     changes = {
         "evaluation": False, "loggers": [], "create_json": False, "share_policy_params": False,
-        "max_n_frames": steps, "gamma": 0.9, "lr": 5e-4, "adam_eps": 1e-5, "clip_grad_val": 1.0,
-        "on_policy_collected_frames_per_batch": 800, "on_policy_n_envs_per_worker": 8,
+        "max_n_frames": steps, "gamma": 0.95, "lr": 1e-3, "adam_eps": 1e-5, "clip_grad_val": 1.0,
+        "on_policy_collected_frames_per_batch": 1600, "on_policy_n_envs_per_worker": 16,
         "on_policy_n_minibatch_iters": 10, "on_policy_minibatch_size": 100,
         "off_policy_collected_frames_per_batch": 800, "off_policy_n_envs_per_worker": 8,
         "off_policy_n_optimizer_steps": 200, "exploration_eps_init": 0.5,

@@ -12,9 +12,10 @@ these levels, and ``OPTIMUM`` their long-run cost per period.
 
 **Rule.** Each stage orders up to the mean demand of its lead time, so it has no safety stock.
 
-**Orders.** A stage has room for twice the mean demand of its lead time, and orders no more than it
-has room for. Without this limit, stage 1 may learn to order far too much: it costs nothing to be
-owed goods, and smaller orders then change nothing for a long time.
+**Orders.** A stage has room for one and a half times the mean demand of its lead time, and orders
+no more than it has room for. With more room, training may stand still: if stages 1 and 2 order all
+that there is, stages 2 and 3 have nothing left, and somewhat smaller orders change nothing. Without
+a limit, this costs 10 % more than the optimum, with this one 5 %.
 
 **Observations.** Five numbers for each stage, all in periods of mean demand (see ``look``). They do
 not depend on the orders of the same period. So a stage sees the same in all views.
@@ -68,7 +69,7 @@ UNIT: Final = 250.0
 MOST: Final = 2 * DEMAND
 """The largest order."""
 
-ROOM: Final = tuple(2 * level for level in RULE_LEVELS)
+ROOM: Final = tuple(1.5 * level for level in RULE_LEVELS)
 """The largest local position of each stage."""
 
 QUANTITIES: Final = tuple(number / 2 for number in range(21))

@@ -22,10 +22,10 @@ from simenv_marl import parallel_env
 from .command import Policies, command
 from .env import OPTIONS, PERIODS, STAGES, SerialSupply, order, profit
 
-STEPS: Final = 80_000
+STEPS: Final = 64_000
 """The number of periods."""
 
-BATCH: Final = 800
+BATCH: Final = 1600
 
 # -- glue: begin ----------------------------------------------------------------------------------
 
@@ -47,7 +47,7 @@ def train(seed: int, steps: int = STEPS) -> Policies:
         .multi_agent(policies=set(STAGES), policy_mapping_fn=lambda agent, episode, **_: agent)
         .rl_module(model_config=network)
         .training(train_batch_size_per_learner=BATCH, minibatch_size=100, num_epochs=10)
-        .training(lr=[[0, 1e-3], [steps, 0.0]], gamma=0.9, lambda_=0.9, grad_clip=1.0)
+        .training(lr=[[0, 2e-3], [steps, 0.0]], gamma=0.95, lambda_=0.9, grad_clip=1.0)
         .training(use_kl_loss=False, vf_clip_param=float("inf"))
         .debugging(seed=seed)
         .build_algo()

@@ -65,7 +65,7 @@ def learn(env: Any, seed: int, steps: int, *, central: bool) -> Policies:
     loss = ClipPPOLoss(policy, value, entropy_coeff=0.0, normalize_advantage=True)
     names = ("action", "reward", "done", "terminated")
     loss.set_keys(value=("stages", "state_value"), **{name: ("stages", name) for name in names})
-    loss.make_value_estimator(gamma=0.9, lmbda=0.9)  # GAE
+    loss.make_value_estimator(gamma=0.95, lmbda=0.9)  # GAE
     optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, max(1, steps // BATCH))
     for data in Collector(env, policy, frames_per_batch=BATCH, total_frames=steps):

@@ -35,11 +35,11 @@ EXAMPLE = Path(commands.ROOT) / "examples" / "serial_supply"
 
 RECIPES = {
     "sb3_turn": ("stable_baselines3", 2400),
-    "torchrl_mappo": ("torchrl.collectors:Collector", 800),
-    "independent": ("torchrl.collectors:Collector", 800),
-    "selfish": ("torchrl.collectors:Collector", 800),
-    "rllib_ppo": ("ray", 800),
-    "benchmarl_recipe mappo": ("benchmarl", 800),
+    "torchrl_mappo": ("torchrl.collectors:Collector", 1600),
+    "independent": ("torchrl.collectors:Collector", 1600),
+    "selfish": ("torchrl.collectors:Collector", 1600),
+    "rllib_ppo": ("ray", 1600),
+    "benchmarl_recipe mappo": ("benchmarl", 1600),
     "benchmarl_recipe qmix": ("benchmarl", 800),
     "benchmarl_recipe vdn": ("benchmarl", 800),
 }
@@ -142,7 +142,7 @@ def test_the_table_resumes_and_shows_all_learners(tmp_path):
     pytest.importorskip("torchrl")
     table = import_module("examples.serial_supply.table")
     figure = tmp_path / "figure.png"
-    arguments = ["--trainings", "2", "--runs", "3", "--steps", "800"]
+    arguments = ["--trainings", "2", "--runs", "3", "--steps", "1600"]
     arguments += ["--out", str(tmp_path), "--figure", str(figure)]
     table.main(arguments)
     first = (tmp_path / "table.csv").read_text()

@@ -16,6 +16,7 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from ..core import (
     ILLEGAL,
+    MASK,
     Agent,
     Episode,
     EpisodePolicy,
@@ -360,7 +361,8 @@ class TurnPlayer(Player):
     ) -> None:
         super().__init__(env, base, "all agents")
         info: Info = {"agent": self.agent.name}
-        self.view.turn.add_mask(self.agent, info)
+        if self.view.turn.has_masks:
+            info[MASK] = self.mask
         self.latest = {self.name: (self.view.turn.observe(self.agent), info)}
         if isinstance(base, Mapping) and self._space_of(self.name) != self.view.action_space:
             raise OptionValueError(
@@ -398,8 +400,8 @@ class TurnPlayer(Player):
             return super().decide()
         action = self._decide_for(self.agent.name)
         if action is not RULE:
-            own = self.agent.validate(action)
-            action = self.view.turn.seat(self.agent).code.encode(own)
+            code = self.view.turn.seats[self.agent.point.hook].code
+            action = code.encode(self.agent.validate(action))
         return action
 
 

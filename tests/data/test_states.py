@@ -140,19 +140,6 @@ def test_states_of_observations_are_those_of_an_aec_environment(design, several,
             assert state.tolist() == expected[key].tolist()
 
 
-def test_states_take_the_dtype_of_the_simulation_without_a_space():
-    class Plain(Yard):
-        def state(self):
-            return np.array([[self.fortune]], np.int16)
-
-    policies = everywhere(by_row(advised))
-    given = {"points": POINTS, "seeds": range(3), "state_in_info": True}
-    for each in collect_episodes(lambda: Plain(BUSY), policies, **given).values():
-        assert each.states.dtype == np.int16
-        assert each.states.shape == (len(each), 1, 1)
-        assert each.last_states.dtype == np.int16
-
-
 def test_states_are_not_asked_where_nobody_wants_them():
     class Silent(Yard):
         def state(self):
@@ -302,37 +289,6 @@ def test_policies_get_the_states_of_branches():
     assert len(seen) > 5
 
 
-def test_states_of_observations_are_the_same_for_all_policies():
-    options = {
-        "points": POINTS,
-        "possible_agents": ROSTER,
-        "state_space": "observations",
-    }
-    states = []
-
-    def one(observation, *, _state):
-        states.append(_state)
-        assert _state.shape == (52,)
-        return advised(observation)
-
-    def many(observations, infos, identities, *, _state):
-        states.append(_state[0])
-        return list(map(advised, observations))
-
-    simulate(busy, everywhere(one), seed=1, **options)
-    expected = np.array(states)
-    for run in (
-        lambda: simulate_many(busy, everywhere(many), seeds=[1], **options),
-        lambda: evaluate(busy, {"a": everywhere(one)}, seeds=[1], **options),
-        lambda: evaluate(busy, {"a": everywhere(many)}, seeds=[1], batched=True, **options),
-    ):
-        states.clear()
-        run()
-        assert np.array_equal(np.array(states), expected)
-    found = collect_episodes(busy, everywhere(many), seeds=[1], **options).values()
-    assert sum(map(len, found)) == len(expected)
-
-
 def test_mixtures_and_comparisons_pass_states_on():
     def two(observations, *, _state):
         assert _state[:, 0].tolist() == observations[:, 2].tolist()
@@ -428,11 +384,3 @@ def test_states_that_cannot_be_stacked_are_refused():
             calling(ant), {"ant_0": by_row(lambda seen: 1)}, seeds=[4], state_in_info=True
         )
     assert "seed 4" in "".join(caught.value.__notes__)
-
-
-def test_a_parameter_for_the_state_must_be_keyword_only():
-    def positional(observations, _state):
-        return [0] * len(observations)
-
-    with pytest.raises(ValueError, match="keyword-only"):
-        simulate_many(busy, {"planner": positional}, points=POINTS, seeds=[1])

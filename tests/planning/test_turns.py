@@ -83,16 +83,6 @@ def test_values_among_births_and_deaths_are_those_by_hand(flatten):
         env.step(told.best)
 
 
-def test_a_team_reward_is_the_return():
-    env = made(team_reward=lambda duel: duel.value)
-    told = action_values(env, futures=2, horizon=3)
-    table = [
-        [by_hand(env, action, seed, base=RULE, horizon=3) for seed in futures_of(env, 2)]
-        for action in range(3)
-    ]
-    assert told.returns == pytest.approx(np.array(table))
-
-
 @METHODS
 def test_a_base_by_agent_sees_and_acts_as_the_agents_do(method):
     env = made()
@@ -199,42 +189,3 @@ def test_trees_of_turn_views_find_the_best_sequence(method):
     assert branch(env, lambda twin, number: planner.choose(twin).best, method=method) == [best[0]]
     chance = TreeSearchPolicy([0, 2], depth=2, futures=8, margin=0, method=method)
     assert chance.choose(made()).best == 2  # because the first move pays the one on the left alone
-
-
-@METHODS
-def test_clones_of_turn_views_can_be_planned_in(method):
-    env = made(Unseeded)
-    env.step(2)
-    twin = clone(env, method=method)
-    with pytest.warns(UserWarning, match="cannot draw new"):
-        values = [action_values(each, base=rising, futures=1).means for each in (env, twin)]
-    assert values[0].tolist() == values[1].tolist()
-    twin.close()
-
-
-def test_in_a_branch_a_planner_answers_with_its_base():
-    env = made()
-    seen = []
-
-    def look(observation, info):
-        seen.append((observation["kind"], info["agent"], info["action_mask"].tolist()))
-        return 2
-
-    def nested(twin):
-        return float(action_values(twin, base=look).best)
-
-    told = action_values(env, [1], futures=1, horizon=1, terminal_value=nested, method="replay")
-    assert seen == [(1, "right", [1, 1, 1])]
-    assert told.means[0] == pytest.approx(
-        by_hand(env, 1, futures_of(env, 1)[0], base=RULE, horizon=1, terminal=2.0)
-    )
-
-
-def test_policies_of_the_environment_stay_in_turn_views():
-    env = made(policies={"right": lambda seen: 2})
-    told = action_values(env, futures=2, base={"left": lambda seen: 0, "right": RULE})
-    table = [
-        [by_hand(env, action, seed, base=lambda *_: 0) for seed in futures_of(env, 2)]
-        for action in range(3)
-    ]
-    assert told.returns == pytest.approx(np.array(table))

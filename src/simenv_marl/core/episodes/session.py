@@ -7,7 +7,7 @@ freed at once, together with its session.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -161,14 +161,17 @@ class Session(BaseSession):
                     self._installed = Installation(self.plan.patches)
                 self._warn_of_outdated()
                 self.options = options
-                for tried in self._seeds_to_try(self.seed_for(seed)):
-                    self.seed = tried
+                self.seed = self.seed_for(seed)
+                more: list[int] | None = None
+                while True:
                     self._enter_ready_driver(driver)
                     try:
-                        return self._begin(tried, in_rounds, replay, beside)
-                    except NoDecisionError as error:
-                        missing = error
-                raise missing
+                        return self._begin(self.seed, in_rounds, replay, beside)
+                    except NoDecisionError:
+                        more = self._more_seeds(self.seed) if more is None else more
+                        if not more:
+                            raise
+                        self.seed = more.pop()
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
 
@@ -186,15 +189,14 @@ class Session(BaseSession):
                 " points=, and make the environment anew"
             )
 
-    def _seeds_to_try(self, seed: int) -> Iterator[int]:
-        """Yield the seed of a reset, and more for an agent that is not born in each episode."""
-        yield seed
+    def _more_seeds(self, seed: int) -> list[int]:
+        """Return seeds that follow from one, for an agent that is not born in each episode."""
         simulation = self._simulation
         if self.plan.options.agent is None or not takes(simulation.reset, "seed"):
-            return
-        if not getattr(simulation, "deterministic", False):
-            more = np.random.SeedSequence(seed).generate_state(MOST_SEEDS - 1)
-            yield from map(int, more)
+            return []
+        if getattr(simulation, "deterministic", False):
+            return []
+        return list(map(int, np.random.SeedSequence(seed).generate_state(MOST_SEEDS - 1)))
 
     def _enter_ready_driver(self, entered: Driver) -> None:
         """Replace the driver if it cannot run another job. ``entered``: the context's driver."""

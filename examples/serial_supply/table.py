@@ -23,7 +23,7 @@ import torch
 from matplotlib.figure import Figure
 from scipy import stats
 
-from simenv_marl import evaluate
+from simenv_marl.experiments import run_experiment
 
 from .command import SEEDS, Policies
 from .env import OPTIMUM, OPTIONS, PERIODS, SerialSupply, base_stocks, profit
@@ -65,9 +65,10 @@ def trained(name: str, seed: int, folder: Path, steps: int | None = None) -> Pol
 
 def costs_of(contenders: dict[str, Policies], seeds: Sequence[int], store: Path) -> pd.DataFrame:
     """Return the mean cost of a period, a row for each seed and a column for each contender."""
-    found = evaluate(
+    found = run_experiment(
         SerialSupply,
-        contenders,
+        [{}],
+        contenders=contenders,
         seeds=seeds,
         metric={"cost": lambda chain: chain.cost / PERIODS},
         batched=True,
@@ -76,7 +77,7 @@ def costs_of(contenders: dict[str, Policies], seeds: Sequence[int], store: Path)
         team_reward=profit,
         **OPTIONS,
     )
-    rows = found.frame[found.frame.agent == "team"]
+    rows = found[found.agent == "team"]
     return rows.pivot(index="seed", columns="contender", values="cost")
 
 

@@ -60,14 +60,18 @@ soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver greenlet
 	$(BIN)/python -m benchmarks.soak --driver thread
 
-# Tests with real learners. RLlib pins an older Gymnasium than the others need, so it has its own virtual environment.
+# Tests with real learners. RLlib pins an older Gymnasium than the others need, and BenchMARL an older TorchRL, so both have
+# their own virtual environments.
 CLIENTS ?= tests/clients
-test-clients: .venv-clients/.clients
+RECIPES := tests/clients/test_serial_supply.py -k recipe
+test-clients: .venv-clients/.clients .venv-benchmarl/.benchmarl
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest $(CLIENTS) \
 	    --ignore tests/clients/test_rllib.py --ignore tests/clients/test_supersuit.py
+	OMP_NUM_THREADS=1 .venv-benchmarl/bin/python -m pytest $(RECIPES)
 
 test-rllib: .venv-rllib/.rllib
 	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py tests/clients/test_experiment.py
+	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest $(RECIPES)
 
 # SuperSuit, and the dependencies of those wrappers of Gymnasium and PettingZoo that make videos, windows and tensors.
 test-wrappers: .venv-wrappers/.wrappers
@@ -78,7 +82,7 @@ test-browser: .venv-browser/.browser
 	test -x /usr/bin/chromium || (apt-get update --quiet && apt-get install --yes --quiet chromium)
 	.venv-browser/bin/python -m pytest -rs tests/seats/play/test_browser.py
 
-.venv-clients/.clients .venv-rllib/.rllib .venv-wrappers/.wrappers .venv-browser/.browser: pyproject.toml
+.venv-clients/.clients .venv-rllib/.rllib .venv-benchmarl/.benchmarl .venv-wrappers/.wrappers .venv-browser/.browser: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@

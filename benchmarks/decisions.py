@@ -1,4 +1,4 @@
-"""The cost of a decision in the AEC view, in the single view, and without an environment."""
+"""The cost of a decision in AEC, single and turn views, and without an environment."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from benchmarks.noop import (
     TurnsBy,
     aec,
     single,
+    vector,
 )
-from simenv_marl import aec_env, single_env
+from simenv_marl import aec_env, single_env, turn_env, vector_env
 
 MANY = 10_000
+TOGETHER = 64
 
 
 def groups(number: int) -> Iterator[Group]:
@@ -99,6 +101,7 @@ def groups(number: int) -> Iterator[Group]:
         ]
     )
     thread.close()
+    yield from of_teams(number)
 
     few = min(100, many // 2)
     dead_many = dead_steps(aec_env(Crowd(many, rounds=1), Entity.decide), many)
@@ -107,6 +110,27 @@ def groups(number: int) -> Iterator[Group]:
         [Row(f"AEC, a dead agent's step, entities: {MANY:,} / 100", dead_many, dead_few, 1.2, 1.1)],
         most=6,
     )
+
+
+def of_teams(number: int) -> Iterator[Group]:
+    """Yield the rows of the turn view, and of the team's reward."""
+    points = [Model.left, Model.right]
+    envs = vector_env(Turns, points, num_envs=TOGETHER, view="turn")
+    alone = single(single_env(Alone, Model.left), number)
+    turn = single(turn_env(Turns, points), number)
+    flat = single(turn_env(Turns, points, flatten=True), number)
+    together = vector(envs, TOGETHER, number)
+    each = aec(aec_env(Turns, points), number)
+    team = aec(aec_env(Turns, points, team_reward=lambda turns: 1.0), number)
+    yield Group(
+        [
+            Row("turn view / single", turn, alone, 1.15),
+            Row("turn view, flatten=True / turn view", flat, turn),
+            Row(f"turn view, {TOGETHER} in a vector / turn view", together, turn),
+            Row("AEC, team_reward= / AEC", team, each),
+        ]
+    )
+    envs.close()
 
 
 def calls_alone(function: Any, argument: Any, number: int) -> Contender:

@@ -15,7 +15,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import HumanRendering
 
 from simenv_marl import RULE, SimEnvError, register_simulation
-from simenv_marl.errors import OptionValueError, UnknownOptionError, UnknownPointError
+from simenv_marl.errors import (
+    OptionValueError,
+    UnknownOptionError,
+    UnknownPointError,
+    ViewError,
+)
 from simenv_marl.experiments import Variant
 from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
@@ -25,7 +30,8 @@ from tests.worlds.undone import registries_put_back
 
 ROOT = Path(__file__).parent.parent
 SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
-JOINT, COOP = "manyregistered/Joint-v0", "manyregistered/coop_v0"
+JOINT, TURN = "manyregistered/Joint-v0", "manyregistered/Turn-v0"
+COOP = "manyregistered/coop_v0"
 
 
 @pytest.fixture
@@ -41,7 +47,7 @@ def made(identity, **options):
 
 
 def test_there_is_an_id_for_each_point_and_one_for_all_views_of_several_agents():
-    assert [*SINGLES, JOINT, COOP] == many_registered.IDS
+    assert [*SINGLES, JOINT, TURN, COOP] == many_registered.IDS
     assert set(many_registered.IDS[:-1]) <= set(gymnasium.registry)
     for kind, base in (("aec", pettingzoo.AECEnv), ("parallel", pettingzoo.ParallelEnv)):
         spec = pettingzoo.spec(kind, COOP)
@@ -72,7 +78,9 @@ def test_all_other_points_run_their_rule_or_the_policy_that_is_given(register):
     )
     for key in (Boat.set_sail, f"{Boat.__module__}.Boat.set_sail", "sail_0"):
         ids = register(Voyage, name="policies", policies={key: lambda observation: 0.25})
-        assert ids == ["policies/SteerBoat-v0", "policies/Joint-v0", "policies/coop_v0"]
+        assert ids == [
+            f"policies/{title}" for title in ("SteerBoat-v0", "Joint-v0", "Turn-v0", "coop_v0")
+        ]
         assert pettingzoo.make("aec", ids[-1]).possible_agents == ["helm_0"]
         assert list(made(ids[1]).action_space.spaces) == ["helm_0"]
         assert 0.14 < sailed(made(ids[0])) < 0.36
@@ -106,6 +114,7 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
         "versions/SteerBoat-v0",
         "versions/SetSail-v0",
         "versions/Joint-v0",
+        "versions/Turn-v0",
         "versions/coop_v0",
     ]
     assert second == [identity.replace("v0", "v3") for identity in first]
@@ -122,7 +131,7 @@ def test_points_are_those_that_are_named(register):
         )
     }
     ids = register(Voyage, steering, name="named")
-    assert ids == ["named/SteerBoat-v0", "named/Joint-v0", "named/coop_v0"]
+    assert ids == ["named/SteerBoat-v0", "named/Joint-v0", "named/Turn-v0", "named/coop_v0"]
     assert pettingzoo.make("aec", "named/coop_v0").possible_agents == ["helm_0"]
     assert list(made("named/Joint-v0").action_space.spaces) == ["helm_0"]
     assert made(ids[0]).action_space == spaces.Discrete(2)
@@ -135,7 +144,7 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
     ids = register(
         calling(clerk, lambda: Being(0).act()), points, name="mixed", possible_agents=roster
     )
-    assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/coop_v0"]
+    assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/Turn-v0", "mixed/coop_v0"]
     env = made(ids[0])
     env.reset()
     env.step(4)
@@ -144,25 +153,58 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
     assert set(made(ids[1]).action_space.spaces) == {"clerk_0", "being_0"}
 
 
+@pytest.mark.parametrize("view", ["Joint", "Turn"])
 @pytest.mark.parametrize("flatten", [False, True])
-def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
+def test_flatten_is_an_option_of_joint_and_turn_views_alone(register, flatten, view):
     """The option of ``make`` comes before the registration's, and that before the variant's."""
     ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
     for options, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
-        env = made("flat/Joint-v0", **options)
-        assert isinstance(env.action_space, spaces.Box) is expected
+        env = made(f"flat/{view}-v0", **options)
+        assert isinstance(env.observation_space, spaces.Box) is expected
         check_env(env)
-        envs = gymnasium.make_vec("flat/Joint-v0", num_envs=2, **options).unwrapped
-        assert isinstance(envs.single_action_space, spaces.Box) is expected
+        envs = gymnasium.make_vec(f"flat/{view}-v0", num_envs=2, **options).unwrapped
+        assert isinstance(envs.single_observation_space, spaces.Box) is expected
         envs.close()
     made(ids[0]).reset()
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
+def test_states_stand_in_the_infos_of_joint_and_turn_views_alone(register):
+    class Charted(Voyage):
+        def state(self):
+            return [self.boat.place]
+
+    ids = register(Charted, name="charted", state_in_info=True)
+    assert [made(each).reset()[1].keys() >= {"state"} for each in ids[:4]] == [
+        *(False, False),
+        *(True, True),
+    ]
+    pettingzoo.make("aec", ids[-1]).reset()
+
+
+def test_the_turn_view_takes_all_decisions_and_limits_of_vectors(register):
+    env = made(TURN, max_steps=3)
+    observation, info = env.reset(seed=1)
+    assert (observation["kind"], info["agent"]) == (0, "helm_0")
+    assert [env.step(RULE)[3] for _ in range(3)] == [False, False, True]
+    envs = gymnasium.make_vec(TURN, num_envs=2, max_episode_steps=2)
+    envs.reset(seed=1)
+    ends = [envs.step(envs.action_space.sample())[3].tolist() for _ in range(2)]
+    assert ends == [[False, False], [True, True]]
+    envs.close()
+    text = decision(agent="clerk_0", action_space=spaces.MultiBinary(2))
+    number = decision(agent="guard_0")
+    ids = register(calling(text, number), [text, number], name="apart")
+    with pytest.raises(ViewError, match="a Discrete or a Box"):
+        made("apart/Turn-v0")
+    assert ids[-3:-1] == ["apart/Joint-v0", "apart/Turn-v0"]
+
+
 def test_names_of_points_become_camel_case_and_stay_distinct(register):
-    """The joint view's id is taken, names differ in spelling alone, and classes share names."""
+    """The ids of joint and turn views are taken, and names differ in spelling or class alone."""
     named = [
         "Robot.joint",
+        "Robot.turn",
         "Robot.choose_2nd_route",
         "Robot.open_grip",
         "Robot.openGrip",
@@ -185,10 +227,10 @@ def test_names_of_points_become_camel_case_and_stay_distinct(register):
             define(agent=f"robot_{number}", observation_space_mapping=lambda n=number: [0, n])(rule)
         )
     ids = register(calling(*points), points, name="robots")
-    assert ids[:2] == ["robots/RobotJoint-v0", "robots/Choose2ndRoute-v0"]
-    assert "robots/Joint-v0" in ids
-    assert len(set(ids)) == len(ids) == len(points) + 2
-    assert [made(each).reset()[0].tolist() for each in ids[:-2]] == [
+    assert ids[:2] == ["robots/RobotJoint-v0", "robots/RobotTurn-v0"]
+    assert ids[-3:-1] == ["robots/Joint-v0", "robots/Turn-v0"]
+    assert len(set(ids)) == len(ids) == len(points) + 3
+    assert [made(each).reset()[0].tolist() for each in ids[:-3]] == [
         [0, number] for number in range(len(points))
     ]
 
@@ -265,11 +307,12 @@ def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
         HumanRendering, "_render_frame", lambda env: shown.append(env.env.render().shape)
     )
     ids = register(Pictured, name="pictured")
-    env = gymnasium.make(ids[0], render_mode="human")
-    assert env.render_mode == "human"
-    env.reset(seed=1)
-    env.step(env.action_space.sample())
-    assert shown == [(8, 8, 3)] * 2
+    for identity in (ids[0], "pictured/Turn-v0"):
+        env = gymnasium.make(identity, render_mode="human")
+        assert env.render_mode == "human"
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+    assert shown == [(8, 8, 3)] * 4
 
 
 @pytest.mark.parametrize("name", ["two_words", "two-words"])

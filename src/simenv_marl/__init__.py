@@ -41,7 +41,15 @@ if TYPE_CHECKING:
     from .core.copies.clone import branch, clone
     from .core.switching.generators import Streams, reseed_generators
     from .decision import Definition, difference, make_step
-    from .envs import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
+    from .envs import (
+        aec_env,
+        generate_env,
+        joint_env,
+        parallel_env,
+        single_env,
+        turn_env,
+        vector_env,
+    )
     from .errors import SimEnvError
     from .experiments.evaluation import evaluate
     from .registration import register_simulation
@@ -54,7 +62,7 @@ __all__ = [
     "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation",
     "Streams", "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env",
     "make_step", "parallel_env", "register_simulation", "reseed_generators", "simulate",
-    "simulate_many", "single_env", "vector_env",
+    "simulate_many", "single_env", "turn_env", "vector_env",
 ]  # fmt: skip
 
 ROOMS = (
@@ -74,7 +82,15 @@ _MODULES = {
     "core.copies.clone": ("branch", "clone"),
     "core.switching.generators": ("Streams", "reseed_generators"),
     "decision": ("Definition", "difference", "make_step"),
-    "envs": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
+    "envs": (
+        "aec_env",
+        "generate_env",
+        "joint_env",
+        "parallel_env",
+        "single_env",
+        "turn_env",
+        "vector_env",
+    ),
     "errors": ("SimEnvError",),
     "experiments.evaluation": ("evaluate",),
     "runs": ("simulate", "simulate_many"),

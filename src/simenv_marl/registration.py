@@ -21,6 +21,9 @@ from .simulation import Model, check_count
 _RECIPES: Final[dict[str, tuple[Model, Points, ViewOptions]]] = {}
 """The registered simulations with their points and options, by name and version."""
 
+_UNITED: Final = ("Joint", "Turn")
+"""The views of one learner for all agents, as titles in ids."""
+
 
 def register_simulation(
     simulation: Model,
@@ -33,10 +36,10 @@ def register_simulation(
     """Register the environments of a simulation with Gymnasium and PettingZoo.
 
     Gymnasium ids: ``name/<Point>-v0`` is the single view of a decision point whose agent has a
-    fixed name (the function's name in CamelCase; all other points follow their rule), and
-    ``name/Joint-v0`` is the joint view. PettingZoo id: ``name/coop_v0``, as AEC and parallel
-    environment. Call this where the simulation's module is imported, so that
-    ``gymnasium.make("module:name/Joint-v0")`` finds it.
+    fixed name (the function's name in CamelCase; all other points follow their rule),
+    ``name/Joint-v0`` the joint view, and ``name/Turn-v0`` the turn view. PettingZoo id:
+    ``name/coop_v0``, as AEC and parallel environment. Call this where the simulation's module is
+    imported, so that ``gymnasium.make("module:name/Joint-v0")`` finds it.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a
@@ -71,7 +74,7 @@ def register_simulation(
         views[title] = {"view": "single", "agent": point.agent or plan.one_agent}
         if point.agent is not None:  # the view has no other agents, and so no roster
             views[title] |= {"possible_agents": None, "undeclared": "error"}
-    views["Joint"] = {"view": "joint"}
+    views |= {title: {"view": title.lower()} for title in _UNITED}
     ids: list[str] = []
     for title, view in views.items():
         identity = f"{name}/{title}-v{version}"
@@ -104,7 +107,7 @@ def _titles(points: list[str]) -> list[str]:
     names = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
     styles = [*([_camel(name, parts) for name in names] for parts in (1, 2)), names]
     return [
-        next(style[place] for style in styles if [*style, "Joint"].count(style[place]) == 1)
+        next(style[place] for style in styles if [*style, *_UNITED].count(style[place]) == 1)
         for place in range(len(names))
     ]
 
@@ -135,7 +138,7 @@ def make_view(
     plan = plan_of(simulation, points, options)
     modes = plan.subject.render_modes
     is_shown = mode == "human" and mode not in modes and "rgb_array" in modes
-    in_window = is_shown and view in ("single", "joint")
+    in_window = is_shown and view not in ("aec", "parallel")
     env = view_class(plan, view)(plan.amended({"render_mode": "rgb_array" if in_window else mode}))
     return HumanRendering(env) if in_window else env
 
@@ -171,7 +174,7 @@ def _recall(
             ' registers it, or make the environment by "module:id"'
         )
     simulation, points, defaults = _RECIPES[recipe]
-    all_options: dict[str, Any] = {**defaults, **options}
-    if view != "joint" and "flatten" not in options:
-        all_options["flatten"] = False  # an option of the joint view alone
-    return simulation, points, all_options
+    unused: dict[str, Any] = {}  # options of other views
+    if view.title() not in _UNITED:
+        unused = {"flatten": False, "state_in_info": False}
+    return simulation, points, {**defaults, **unused, **options}

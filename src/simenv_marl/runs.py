@@ -39,7 +39,8 @@ def simulate(
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a
             ``Variant``.
         policies: The policies: a dict from an agent or a decision point to a callable. The callable
-            gets the observation, or the observation and the info, and returns an action.
+            gets the observation, or the observation and the info, and returns an action. A
+            keyword-only parameter ``_state`` gets the simulation's state.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
             ``policies``, there are no decision points and the plain model runs.
         seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is
@@ -98,8 +99,10 @@ def simulate_many(
             action, or of all, leaves the decision to the model. A tuple of actions and a dict is
             allowed; the dict is ignored here (see ``collect_episodes``). If several keys have the
             same policy object, their decisions share batches. One batch never mixes different
-            spaces. The policies of a ``Variant`` answer one decision at a time; so do policies that
-            ask for ``_environment`` or ``_decision``, and coroutine functions, which are awaited.
+            spaces. A keyword-only parameter ``_state`` gets the stacked states of the simulations,
+            as ``state()`` of an environment returns them. The policies of a ``Variant`` answer one
+            decision at a time; so do policies that ask for ``_environment`` or ``_decision``, and
+            coroutine functions, which are awaited.
         seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
             ``policies``, there are no decision points and the plain models run.

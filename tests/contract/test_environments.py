@@ -272,13 +272,19 @@ def test_policies_of_agents_that_a_callable_names_by_any_name():
 # -- agents ---------------------------------------------------------------------------------------
 
 
-def test_an_agent_has_one_decision_point():
-    named, other = (decision(agent=lambda: "pump_0") for _ in range(2))
+def test_points_of_one_agent_have_equal_spaces_and_one_policy():
+    few = {"agent": lambda: "pump_0", "action_space": spaces.Discrete(3)}
+    named, other = decision(**few), decision(agent=lambda: "pump_0")
     for first, second in ((PUMP, named), (named, other)):
         env = aec_env(calling(first, second), [first, second])
         env.reset()
-        with pytest.raises(AgentError, match="has one decision point"):
+        with pytest.raises(AgentError, match="whose spaces or policies differ"):
             env.step(1)
+    again = decision(agent=lambda: "pump_0")
+    env = aec_env(calling(PUMP, again), [PUMP, again], policies={again: lambda observation: 1})
+    env.reset()
+    with pytest.raises(AgentError, match="whose spaces or policies differ"):
+        env.step(1)
 
 
 # -- definitions of the simulation ----------------------------------------------------------------

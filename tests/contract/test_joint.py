@@ -289,18 +289,37 @@ def test_flattened_discrete_spaces_have_one_mask():
             BOX,
             "needs one-dimensional Box",
         ),
-        ({**BOX, "observation_space": spaces.Discrete(3)}, BOX, "needs one-dimensional Box"),
-        ({}, BOX, "all continuous or all discrete"),
+        ({"action_space": spaces.MultiBinary(2)}, BOX, "needs one-dimensional Box"),
     ],
-    ids=["matrix of numbers", "matrix", "number", "partly discrete"],
+    ids=["matrix of numbers", "matrix", "bits"],
 )
 def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
     ant, bee = decision(agent="ant_0", **of_ant), decision(agent="bee_0", **of_bee)
     with pytest.raises(ViewError, match=match):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
     for make in (aec_env, parallel_env):
-        with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
+        with pytest.raises(UnknownOptionError, match="an option of joint and turn views only"):
             make(calling(ant, bee), [ant, bee], flatten=True)
+
+
+def test_a_number_beside_a_vector_is_the_largest_legal_preference():
+    mask = np.array([0, 1, 1], np.int8)
+    ant = decision(
+        agent="ant_0",
+        action_space=spaces.Discrete(3, start=4),
+        action_mask_mapping=lambda: mask,
+        observation_space=spaces.Discrete(2),
+        observation_space_mapping=lambda: 1,
+    )
+    bee = decision(agent="bee_0", **BOX, observation_space=spaces.Box(-9, 9, (2,), np.float32))
+    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
+    assert env.action_space.low.tolist() == [-1, -1, -1, 0]
+    assert env.action_space.high.tolist() == [1, 1, 1, 1]
+    observation, _ = env.reset()
+    assert observation in env.observation_space
+    assert observation.tolist() == [0, 1, 0, 0]
+    env.step(np.array([0.9, -0.5, 0.5, 0.25], np.float32))
+    assert env.simulation.log == [6, 0.25]
 
 
 # -- Gymnasium's check ----------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Locks that a suspended simulation holds while another simulation waits for them."""
 
-import gc
 import os
 import sys
 import threading
@@ -59,32 +58,6 @@ class Drains(Model):
             Model.lock.release()
 
 
-class Counts(Model):
-    lock = threading.Semaphore()
-
-    def work(self):
-        with self.lock:
-            self.decide()
-
-
-def synchronized(function):
-    def locked(*args):
-        with Model.lock:
-            return function(*args)
-
-    return locked
-
-
-class Synchronizes(Model):
-    run = synchronized(Model.run)
-
-
-class Enters(Model):
-    def __init__(self):
-        with self.lock:
-            self.made = True
-
-
 class Caches(Model):
     @cached_property
     def plan(self):
@@ -136,9 +109,6 @@ def begin(model, driver, envs):
         (Drains, Drains),
         (Fills, Drains),
         (Drains, Fills),
-        (Counts, Counts),
-        (Fills, Enters),
-        (Fills, Synchronizes),
         pytest.param(Caches, Caches, marks=pytest.mark.skipif(not ONE_LOCK, reason="has no lock")),
     ],
 )
@@ -272,17 +242,6 @@ def test_a_wait_that_ends_by_itself_is_not_told(driver, model, capfd):
 
 
 # -- the watching thread --------------------------------------------------------------------------
-
-
-def test_one_simulation_alone_is_not_watched():
-    gc.collect()
-    if STACKS:
-        pytest.skip("other tests have left simulations")
-    wait_for(lambda: not locks._stops)
-    env = env_of(Model, "greenlet")
-    env.reset()
-    assert not locks._stops
-    env.close()
 
 
 def fork():

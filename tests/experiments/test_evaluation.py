@@ -462,12 +462,13 @@ def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_n
     assert done.stdout.strip() == "set()"
 
 
-def test_two_points_of_the_same_agent_are_refused(monkeypatch):
+def test_two_points_of_the_same_agent_have_one_row(monkeypatch):
     class Doubled(Shop):
         order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
 
     own = [name for name in decision_points() if name.startswith("tests.")]
     # without those of studies
     monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: own)
-    with pytest.raises(AgentError, match="have the same agent"):
-        evaluate(Doubled, {"rule": {}}, seeds=[1])
+    frame = evaluate(Doubled, {"rule": {}}, seeds=[1]).frame
+    assert frame["agent"].tolist() == ["keeper", "team"]
+    assert frame["length"].tolist() == [6, 6]

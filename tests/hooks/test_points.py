@@ -9,6 +9,7 @@ from time import sleep
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, generate_env, simulate, single_env
 from simenv_marl.core.copies import packing
@@ -155,7 +156,10 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch
             "twice",
         ),
         (
-            {Home.heat: define(agent="pump_0"), Home.cool: define(agent="pump_0")},
+            {
+                Home.heat: define(agent="pump_0"),
+                Home.cool: define(agent="pump_0", action_space=spaces.Discrete(3)),
+            },
             AgentError,
             "pump_0",
         ),

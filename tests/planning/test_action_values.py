@@ -30,6 +30,7 @@ from simenv_marl import (
     joint_env,
     parallel_env,
     single_env,
+    turn_env,
     vector_env,
 )
 from simenv_marl.envs import pad_agents
@@ -60,7 +61,8 @@ def begun(env, seed=5):
 def made(view, model=Duel, **options):
     """An environment whose pending decision is that of the one on the left, reset."""
     given = {LEFT: points()[LEFT]} if view == "single" else points()
-    make = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env}.get(view, single_env)
+    several = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env, "turn": turn_env}
+    make = several.get(view, single_env)
     return begun(make(model, given, **options, **{"agent": "left"} if view == "agent" else {}))
 
 
@@ -510,7 +512,7 @@ def high(observation):
 
 @pytest.mark.parametrize(
     ("view", "candidate"),
-    [("aec", 1), ("parallel", 1), ("joint", {"left": 1, "right": 1})],
+    [("aec", 1), ("parallel", 1), ("turn", 1), ("joint", {"left": 1, "right": 1})],
     ids=str,
 )
 def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
@@ -542,7 +544,7 @@ def with_base(base):
         {"right": with_base({"right": with_base(without_base)})},
     ],
 )
-@pytest.mark.parametrize("view", [*VIEWS, "joint"])
+@pytest.mark.parametrize("view", [*VIEWS, "joint", "turn"])
 def test_planners_without_a_base_are_refused_as_bases(view, base):
     env = made(view)
     if view == "single" and isinstance(base, dict):

@@ -23,6 +23,7 @@ from simenv_marl import (
     simulate,
     simulate_many,
     single_env,
+    turn_env,
     vector_env,
 )
 from simenv_marl.data import collect_episodes, compare_with_rule
@@ -132,7 +133,7 @@ def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
 
 
 @METHODS
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env, turn_env])
 def test_planners_decide_in_environments_as_by_hand(make, method):
     env = begun(make(Duel, tame(), policies={"left": planner(method=method)}))
     while not step(env, 1, "right"):

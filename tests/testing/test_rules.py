@@ -23,6 +23,7 @@ from tests.testing.test_testing import (
     checked,
     clean,
     finding,
+    points,
     report_with,
     table_of,
     variant,
@@ -493,3 +494,20 @@ def test_tests_that_are_left_out_are_named_with_the_reason():
     shifted = {"action_space": spaces.Discrete(3, start=1)}
     shifted["action_space_mapping"] = lambda action: action - 2
     assert "PettingZoo's api_test, because of an illegal action" in left_out(checked(Walk, shifted))
+
+
+def test_the_turn_view_is_left_out_where_spaces_cannot_be_united():
+    other = points(Walk, "rest", agent="rester_0", action_space=spaces.MultiBinary(3))
+    report = check_simulation(Walk, points(Walk) | other, episodes=2)
+    assert report.ok
+    told = left_out(report)
+    assert "Gymnasium's check_env (turn view), because agents with different action spaces" in told
+    assert "joint; drivers" in report.checked[0]
+
+
+def test_states_in_infos_are_an_option_of_the_check():
+    class Charted(Walk):
+        def state(self):
+            return [self.place]
+
+    assert not checked(Charted, state_in_info=True, episodes=1).findings

@@ -102,7 +102,8 @@ def test_a_sound_walk_is_clean():
     assert report.findings == ()
     assert "nothing to complain of" in str(report)
     report.raise_for_errors()
-    assert any("aec, parallel, single, joint" in line for line in report.checked)
+    assert any("aec, parallel, single, joint, turn" in line for line in report.checked)
+    assert any("Gymnasium's check_env (turn view)" in line for line in report.checked)
 
 
 def test_points_of_all_kinds_are_clean():
@@ -503,9 +504,9 @@ def test_options_and_points_reach_the_environments():
     assert finding(report, "rest was never called").severity == "warning"
     with pytest.raises(UnknownOptionError, match="polices"):
         checked(Walk, polices={})
-    report = checked(Walk, flatten=True)  # which is of the joint view alone
+    report = checked(Walk, flatten=True)  # which is of joint and turn views alone
     assert report.ok
-    assert "single, joint; drivers" in report.checked[0]
+    assert "single, joint, turn; drivers" in report.checked[0]
     assert checked(Walk, state_space=spaces.Box(0, 1, (1,), np.float32)).ok
     policies = {"ventilator_0": lambda observation: [0.5]}
     report = check_simulation(GreenhouseSim, policies=policies, episodes=1, seeds=[5])
@@ -542,7 +543,7 @@ def test_inspection_shows_points_calls_and_the_end():
     seen = inspect_simulation(GreenhouseSim)
     assert seen.calls == "(update_air_exchange choose_water_amount){9}"
     assert [point["agent"] for point in seen.points] == ["waterer_0", "ventilator_0"]
-    assert seen.views == ("aec", "parallel", "joint")
+    assert seen.views == ("aec", "parallel", "joint", "turn")
     assert "terminated" in seen.ended
     assert "waterer_0" in str(seen)
     assert json.dumps(seen.to_dict())
@@ -550,9 +551,8 @@ def test_inspection_shows_points_calls_and_the_end():
     assert "truncated" in seen.ended
     assert sum(seen.counts.values()) > 50
     assert any("removed_by" in point["uses"] for point in seen.points)
-    assert "Possible views: aec, parallel, single with agent=, joint with possible_agents=" in str(
-        seen
-    )
+    views = "aec, parallel, turn, single with agent=, joint with possible_agents="
+    assert f"Possible views: {views}" in str(seen)
 
 
 def test_inspection_shows_where_a_model_fails():

@@ -16,12 +16,12 @@ from .copies.clone import branch, clone, pending_view
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from .copies.peer import Peer, pack_request, serve
 from .episodes.agent import Agent
-from .episodes.base import BaseSession, checked_seed, close_all
+from .episodes.base import BaseSession, StateReader, checked_seed, close_all
 from .episodes.decision import Decision
 from .episodes.episode import Episode
-from .episodes.round import Round
 from .episodes.session import Session
 from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
+from .episodes.steps import Round
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space
@@ -40,6 +40,8 @@ from .plans.policies import (
     is_asked_alone,
     is_planner,
     policy_for,
+    takes_info,
+    takes_state,
     two_arguments,
     waits,
     when_answered,
@@ -58,29 +60,36 @@ from .switching.generators import (
 )
 from .switching.resources import acquire, release, reuse_resources
 from .values.actions import ILLEGAL, MASK, Mask, action_check
+from .values.common import (
+    ActionCode,
+    Encode,
+    common_actions,
+    common_observations,
+    preferences,
+)
 from .values.spaces import blank, duplicate, observation_cast, same
-from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker, taken
+from .values.stacking import Stacker, joined, split_batch, stacked, stacker, taken
 
 __all__ = [  # noqa: RUF022 - by subject
     # What an environment is made of, and what happens in it.
     "Agent", "BaseSession", "Decision", "Driver", "Episode", "EpisodeState", "Mode", "Plan",
-    "Point", "Round", "Session", "UnmatchedNames", "Where", "checked_actions", "checked_seed",
-    "close_all", "describe", "make_plan", "provenance",
+    "Point", "Round", "Session", "StateReader", "UnmatchedNames", "Where", "checked_actions",
+    "checked_seed", "close_all", "describe", "make_plan", "provenance",
     # Types: the first three are the aliases of values of the user.
     "Observation", "Action", "Model", "Info", "Labels", "Mask", "Points", "Policy", "Source",
     "Space", "Stacker", "CheckOptions", "EpisodeOptions", "ViewOptions",
     # Policies.
     "COUNTS", "Answer", "Answers", "AskingPolicy", "Caller", "DeferredPolicy", "EpisodePolicy",
     "PolicyWrapper", "count", "has_fallback", "is_asked_alone", "is_planner", "policy_for",
-    "two_arguments", "waits", "when_answered",
+    "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
     "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
     "unpack_outcome",
     # Values.
-    "ILLEGAL", "MASK", "action_check", "as_json", "blank", "duplicate",
-    "explain_arguments", "joined", "observation_cast", "same", "source_name",
-    "split_batch", "stack_masks", "stacker", "taken",
+    "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
+    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast",
+    "preferences", "same", "source_name", "split_batch", "stacked", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",
     "is_seed", "preserve_generators", "reseed_generators",

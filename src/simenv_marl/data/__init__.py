@@ -7,6 +7,7 @@ from .collect import (
     compare_with_rule,
 )
 from .demonstrations import record_dataset, save_dataset
+from .deployed import joint_policy, turn_policy
 from .plots import plot_returns
 from .timeline import plot_timeline
 from .trajectories import Trajectories
@@ -17,8 +18,10 @@ __all__ = [
     "Trajectories",
     "collect_episodes",
     "compare_with_rule",
+    "joint_policy",
     "plot_returns",
     "plot_timeline",
     "record_dataset",
     "save_dataset",
+    "turn_policy",
 ]

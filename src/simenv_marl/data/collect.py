@@ -20,10 +20,12 @@ from ..core import (
     Plan,
     Points,
     PolicyWrapper,
+    StateReader,
     is_asked_alone,
     same,
     stacker,
     taken,
+    takes_state,
     when_answered,
 )
 from ..envs.single import plan_of
@@ -113,7 +115,8 @@ def collect_episodes(
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that
-            has a policy counts as declared, even if ``possible_agents`` omits it.
+            has a policy counts as declared, even if ``possible_agents`` omits it. With
+            ``state_space`` or ``state_in_info``, the trajectories have ``states``.
 
     Returns:
         A dict from each key of ``policies`` to the trajectories of the agents of its policy.
@@ -198,7 +201,11 @@ def _play(
     Return the records of each policy, and the result of ``collect`` and the error of each episode.
     """
     plan = make_plan()
-    recorder = Recorder(episodes[0][0] if episodes else 0)
+    options = plan.options
+    keeps_states = options.state_in_info or options.state_space is not None
+    keeps_states |= any(map(takes_state, (options.policies or {}).values()))
+    stack_states = plan.derive(StateReader).stack if keeps_states else None
+    recorder = Recorder(episodes[0][0] if episodes else 0, stack_states)
     collected: list[Any] = [None] * len(episodes)
     errors = [""] * len(episodes)
 
@@ -225,6 +232,9 @@ class Mixture:
 
     Example:
         ``Mixture({RULE: 0.8, trained: 0.2})``
+
+    Attributes:
+        takes_state: Whether one of the policies takes the states.
     """
 
     def __init__(self, parts: Mapping[Any, float] | Iterable[tuple[Any, float]]) -> None:
@@ -256,6 +266,7 @@ class Mixture:
         self._parts = [
             BatchPolicy(_follow_rule if policy is RULE else policy) for policy in policies
         ]
+        self.takes_state = any(part.takes_state for part in self._parts)
 
     def __repr__(self) -> str:
         parts = [
@@ -269,6 +280,8 @@ class Mixture:
         observations: Observation,
         infos: Infos,
         identities: Identities,
+        *,
+        _state: Any = None,
     ) -> Any:
         """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
         component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
@@ -283,6 +296,7 @@ class Mixture:
                 taken(observations, index),
                 [infos[row] for row in rows],
                 [identities[row] for row in rows],
+                taken(_state, index) if part.takes_state else None,
             )
             for row, action in zip(rows, actions, strict=True):
                 answers[row] = action
@@ -312,9 +326,10 @@ def _actions(
     observations: Observation,
     infos: Infos,
     identities: Identities,
+    states: Any,
 ) -> list[Action]:
     """Ask a policy for one action for each decision, and drop its extras."""
-    answers = policy.answers(observations, infos, identities)
+    answers = policy.answers(observations, infos, identities, states)
     return read_answers(answers, policy.policy, len(identities))[0]
 
 
@@ -431,14 +446,17 @@ class _BatchedShadow:
 
     def __init__(self, policy: Callable[..., Action]) -> None:
         self._policy = BatchPolicy(policy)
+        self.takes_state = takes_state(policy)
 
     def __call__(
         self,
         observations: Observation,
         infos: Infos,
         identities: Identities,
+        *,
+        _state: Any = None,
     ) -> Any:
-        actions = _actions(self._policy, observations, infos, identities)
+        actions = _actions(self._policy, observations, infos, identities, _state)
         return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 

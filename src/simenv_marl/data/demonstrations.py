@@ -149,10 +149,10 @@ def save_dataset(
 
     Each trajectory becomes an episode, with its seed. An episode has one more observation than
     actions; the last one is the agent's final observation. Terminations and truncations follow
-    Gymnasium. The infos have one row per observation: ``by_rule``, ``action_mask`` and ``time``
-    where they exist, and all numeric extras. The row of the final observation, where nothing was
-    decided, has zeros, and all actions are legal. The episode's metadata has the ``agent``, the
-    ``episode`` (the index of its seed), and the ``turn`` of its first decision.
+    Gymnasium. The infos have one row per observation: ``by_rule``, ``action_mask``, ``time`` and
+    ``state`` where they exist, and all numeric extras. In the row of the final observation, where
+    nothing was decided, extras are zero, and all actions are legal. The episode's metadata has the
+    ``agent``, the ``episode`` (the index of its seed), and the ``turn`` of its first decision.
 
     Args:
         dataset_id: The name of the data set, by Minari's rules: ``"(namespace/)name-v0"``.
@@ -249,11 +249,11 @@ def _episodes(trajectories: Trajectories) -> Iterator[EpisodeBuffer]:
             rewards=trajectories.rewards[rows],
             terminations=trajectories.terminations[rows],
             truncations=trajectories.truncations[rows],
-            infos=_infos(trajectories, rows),
+            infos=_infos(trajectories, rows, np.array([place])),
         )
 
 
-def _infos(trajectories: Trajectories, rows: Integers) -> dict[str, Any]:
+def _infos(trajectories: Trajectories, rows: Integers, place: Integers) -> dict[str, Any]:
     """Return the infos of a trajectory, with a row for each decision and one for the end."""
     infos: dict[str, Any] = {
         name: _extend(values[rows], 0)
@@ -268,6 +268,9 @@ def _infos(trajectories: Trajectories, rows: Integers) -> dict[str, Any]:
         }
     elif masks is not None:
         infos["action_mask"] = _extend(masks[rows], 1)
+    if trajectories.states is not None:
+        ends = taken(trajectories.last_states, place)
+        infos["state"] = joined([taken(trajectories.states, rows), ends])
     if trajectories.times is not None and trajectories.elapsed is not None:
         times = trajectories.times[rows]
         infos["time"] = np.append(times, times[-1] + trajectories.elapsed[rows[-1]])

@@ -20,10 +20,21 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core import Agent, Episode, Plan, Point, Stacker, blank, joined, stack_masks, stacker, taken
+from ..core import (
+    Agent,
+    Episode,
+    Plan,
+    Point,
+    Stacker,
+    blank,
+    joined,
+    stacked,
+    stacker,
+    taken,
+)
 from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
-from ..simulation import RULE, Action, Observation
+from ..simulation import RULE, Action, Model, Observation
 
 # Types of arrays.
 Array = NDArray[Any]
@@ -60,8 +71,8 @@ UNPAID: Final[dict[str, float]] = {
 }
 """The values of a decision before its reward is known."""
 
-End = tuple[int, bool, bool]
-"""The end of an agent: the turn, and whether the agent terminated and was truncated."""
+End = tuple[int, bool, bool, Model]
+"""The end of an agent: the turn, whether it terminated and was truncated, and the state if kept."""
 
 # -- trajectories for learners --------------------------------------------------------------------
 
@@ -108,6 +119,10 @@ class Trajectories:
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
         elapsed: ``(N,)`` float64: the time from the decision until its reward was known, at the
             agent's next decision or its end. None where there is no clock.
+        states: ``(N, *shape)``, in the dtype of ``state_space`` if there is one: the state at each
+            decision. None without the options ``state_space`` and ``state_in_info``, if no policy
+            asks for ``_state``.
+        last_states: ``(M, *shape)``: the state at the end of each trajectory, or None.
         extras: A dict from name to array, ``(N, ...)``: the values that the policy returned besides
             the actions.
         observation_space, action_space: The spaces of the decision point. None where no agent
@@ -140,6 +155,8 @@ class Trajectories:
     action_masks: Masks | None = None
     times: Floats | None = None
     elapsed: Floats | None = None
+    states: Any = None
+    last_states: Any = None
     extras: Mapping[str, Array] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
@@ -170,10 +187,19 @@ class Trajectories:
     @cached_property
     def next_observations(self) -> Observation:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
+        return self._next(self.observations, self.last_observations)
+
+    @cached_property
+    def next_states(self) -> Any:
+        """``(N, *shape)``: the state at the agent's next decision or its end, or None."""
+        return None if self.states is None else self._next(self.states, self.last_states)
+
+    def _next(self, rows: Any, last: Any) -> Any:
+        """Return the next row of the same agent for each row. The ends have rows of their own."""
         next_rows = np.arange(1, len(self) + 1)
         last_rows = self.starts + self.lengths - 1
         next_rows[last_rows] = len(self) + np.arange(len(last_rows))
-        return taken(joined([self.observations, self.last_observations]), next_rows)
+        return taken(joined([rows, last]), next_rows)
 
 
 def action_arrays(actions: Action, name: str = "") -> Iterator[tuple[str, Array]]:
@@ -198,12 +224,12 @@ class Records:
     Attributes:
         decisions: By attribute of ``Trajectories``, a stack with a row for each decision; as in
             ``DTYPES``.
-        last_observations: The stack of the final observations of the trajectories.
+        ends: The same with a row for each trajectory.
         point: The attributes of ``Trajectories`` that describe the decision point.
     """
 
     decisions: dict[str, Any]
-    last_observations: Observation
+    ends: dict[str, Any]
     point: dict[str, Any]
 
 
@@ -233,7 +259,7 @@ def combine(
     return Trajectories(
         **decisions,
         **nonempty[0].point,
-        last_observations=joined([part.last_observations for part in nonempty]),
+        **joined([part.ends for part in nonempty]),
         starts=starts,
         seeds=seeds,
         names=tuple(codes),
@@ -249,10 +275,11 @@ class _DecisionLog:
     """The decisions of one group, in the order of the answers.
 
     ``point`` is one of the group's decision points. It is None if no point is known; such a log
-    stays empty.
+    stays empty. ``stack_states`` is None if states are not kept.
     """
 
-    def __init__(self, point: Point | None) -> None:
+    def __init__(self, point: Point | None, stack_states: Stacker | None) -> None:
+        self._stack_states = stack_states
         self.stack_observations: Stacker = np.array
         self.stack_actions: Stacker = np.array
         self.point: dict[str, Any] = {}
@@ -273,8 +300,8 @@ class _DecisionLog:
         self.table: dict[str, list[Any]] = {name: [] for name in DTYPES}
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
-        # By row of the last decision.
-        self.last_observations: dict[int, Observation] = {}
+        # The last observation and the last state, by row of the last decision.
+        self.ends: dict[int, tuple[Observation, Model]] = {}
 
     def add(
         self,
@@ -303,7 +330,10 @@ class _DecisionLog:
             "extras": arrays,
         }
         if group.point.legal is not None:
-            batch["action_masks"] = stack_masks([agent.mask for agent in agents])
+            batch["action_masks"] = stacked([agent.mask for agent in agents])
+        if self._stack_states is not None:
+            states = [episode.note_states().read() for episode in episodes]
+            batch["states"] = self._stack_states(states)
         self.batches.append(batch)
         table = self.table
         policies: list[Any] = [agent.policy for agent in agents]
@@ -331,8 +361,9 @@ class _DecisionLog:
         if rule_action is not None:
             self.rule_actions[row] = rule_action
         if end is not None:
-            table["last_turns"][row], table["terminations"][row], table["truncations"][row] = end
-            self.last_observations[row] = agent.observation
+            turns, table["terminations"][row], table["truncations"][row], state = end
+            table["last_turns"][row] = turns
+            self.ends[row] = agent.observation, state
 
     @cached_property
     def columns(self) -> dict[str, Any]:
@@ -343,6 +374,8 @@ class _DecisionLog:
             "actions": self.stack_actions([]),
             "extras": {},
         }
+        if self._stack_states is not None:
+            nothing["states"] = self._stack_states([])
         columns: dict[str, Any] = joined(self.batches or [nothing])
         columns |= {name: np.array(self.table[name], dtype) for name, dtype in DTYPES.items()}
         number = len(columns["times"])
@@ -366,21 +399,20 @@ class _DecisionLog:
         identities = zip(columns["episodes"][rows].tolist(), columns["agents"][rows], strict=True)
         trajectories = [first.setdefault(key, row) for row, key in enumerate(identities)]
         rows = rows[np.lexsort((trajectories, columns["episodes"][rows]))]
-        last = [row for row in rows.tolist() if row in self.last_observations]
-        return Records(
-            decisions=taken(columns, rows),
-            last_observations=self.stack_observations(
-                [self.last_observations[row] for row in last]
-            ),
-            point=self.point,
-        )
+        last = [self.ends[row] for row in rows.tolist() if row in self.ends]
+        ends = {"last_observations": self.stack_observations([seen for seen, _ in last])}
+        if self._stack_states is not None:
+            ends["last_states"] = self._stack_states([state for _, state in last])
+        return Records(taken(columns, rows), ends, self.point)
 
 
 class Recorder:
     """Records the decisions of episodes while they run: a ``Watcher`` for ``BatchRun``."""
 
-    def __init__(self, first_episode: int) -> None:
+    def __init__(self, first_episode: int, stack_states: Stacker | None) -> None:
+        """``stack_states``: None if states are not kept."""
         self._first_episode = first_episode
+        self._stack_states = stack_states
         self._logs: dict[Group, _DecisionLog] = {}
         # The latest decision of each agent that has not ended: its log and its row.
         self._decisions: dict[Agent, tuple[_DecisionLog, int]] = {}
@@ -395,7 +427,7 @@ class Recorder:
     ) -> None:
         """Record decisions and their answers: see ``Watcher``."""
         if group not in self._logs:
-            self._logs[group] = _DecisionLog(group.point)
+            self._logs[group] = _DecisionLog(group.point, self._stack_states)
         log = self._logs[group]
         first = len(log.table["place"])
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
@@ -408,12 +440,16 @@ class Recorder:
         """Record the rewards and the ends of agents: see ``Watcher``."""
         if episode.pending is not None:
             self._pay(episode.pending)
+        ends = {} if episode.states is None else episode.states.ends
         for agent in episode.take_ended():
-            self._pay(agent, (episode.turns, True, False))
+            self._pay(agent, (episode.turns, True, False, ends.pop(agent, None)))
         if episode.over:
-            end = (episode.turns, episode.terminated, episode.truncated)
-            for agent in episode.agents.values():
-                self._pay(agent, end)
+            agents = [agent for agent in episode.agents.values() if agent in self._decisions]
+            state = None
+            if agents and self._stack_states is not None:
+                state = episode.note_states().read()
+            for agent in agents:
+                self._pay(agent, (episode.turns, episode.terminated, episode.truncated, state))
 
     def _pay(
         self,
@@ -446,7 +482,8 @@ class Recorder:
                     " differ; give its policy under the names of the points"
                 )
             if not logs:
-                logs[""] = _DecisionLog(next(points_of(plan, place), None))
+                point = next(points_of(plan, place), None)
+                logs[""] = _DecisionLog(point, self._stack_states)
             (log,) = logs.values()
             records.append(log.records(place))
         return records

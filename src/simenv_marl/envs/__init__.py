@@ -18,11 +18,12 @@ from .joint import SimulationJointEnv
 from .padding import pad_agents
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, plan_of
+from .turn import SimulationTurnEnv
 from .vector import SimulationVectorEnv
 
 __all__ = [
     "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv",
-    "SimulationVectorEnv", "pad_agents",
+    "SimulationTurnEnv", "SimulationVectorEnv", "pad_agents",
 ]  # fmt: skip
 
 VIEWS: Final = {
@@ -30,6 +31,7 @@ VIEWS: Final = {
     "parallel": SimulationParallelEnv,
     "single": SimulationEnv,
     "joint": SimulationJointEnv,
+    "turn": SimulationTurnEnv,
 }
 """The classes of the views of one simulation."""
 
@@ -60,8 +62,8 @@ def generate_env(
     here.
 
     {arguments}
-        view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is
-            active, or if ``agent=`` names one agent; else AEC.
+        view: "aec", "parallel", "single", "joint" or "turn". None: single if one point with one
+            agent is active, or if ``agent=`` names one agent; else AEC.
         {options}
     """
     plan = plan_of(simulation, points, options)
@@ -148,6 +150,23 @@ def joint_env(
 
 
 @explain_arguments
+def turn_env(
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
+) -> SimulationTurnEnv:
+    """Make a Gymnasium environment of one learner that takes each decision as it arises.
+
+    A step answers the pending decision, whichever agent's it is, and runs to the next one of any
+    agent. Agents may be born and die.
+
+    {arguments}
+        {options}
+    """
+    return SimulationTurnEnv(plan_of(simulation, points, options))
+
+
+@explain_arguments
 def vector_env(
     simulation: Model,
     points: Points = None,
@@ -163,12 +182,13 @@ def vector_env(
     """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
 
     Each step returns the same results as a ``gymnasium.vector.SyncVectorEnv`` of as many single (or
-    joint) views.
+    joint, or turn) views.
 
     {arguments}
         num_envs: The number of simulations.
         workers: The number of worker processes. 0: all simulations are suspended in this process.
-        view: "single" or "joint". None: single if one point with one agent is active, else joint.
+        view: "single", "joint" or "turn". None: single if one point with one agent is active, else
+            joint.
         copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they
             return the same arrays every time, and the next call overwrites them.
         autoreset_mode: When a simulation is reset after its episode has ended, as in Gymnasium:

@@ -26,19 +26,21 @@ from ..core import (
     BaseSession,
     EpisodeState,
     Info,
+    Mask,
     Model,
     Observation,
     Plan,
     Point,
     Session,
     Space,
+    StateReader,
     checked_seed,
     describe,
-    observation_cast,
     pack,
     unpack,
 )
 from ..errors import (
+    AgentError,
     UnknownAgentError,
     UnknownOptionError,
     ViewError,
@@ -57,7 +59,16 @@ ResetOptions: TypeAlias = dict[str, Any] | None
 StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
-_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session"))
+_OWN_OPTIONS = {
+    "agent": "the single view",
+    "flatten": "joint and turn views",
+    "state_in_info": "joint and turn views",
+}
+"""The options that not every view takes."""
+
+_NOT_COPIED = frozenset(
+    ("_finalizer", "_lock", "_roster", "joint", "own_agent", "own_seat", "session", "turn")
+)
 """The attributes that each view makes for itself."""
 
 
@@ -69,16 +80,17 @@ class View:
         method            is called                                 is filled by
         ------            ---------                                 ------------
         adapt             with the plan, before the session         several agents, single, planner
-        set_up            when a view is made or cloned, and when   single, joint, planner
+        set_up            when a view is made or cloned, and when   one agent, planner
                           another process may have reset it
-        _original_spaces  when an agent's spaces are first read     View, joint
-        spaces_of         when a vector environment is made         single, joint
+        _original_spaces  when an agent's spaces are first read     View, joint, turn
+        spaces_of         when a vector environment is made         one agent
         reset             by the user                               all
-        begin             at the first decision of a reset          AEC, parallel, single, joint
+        begin             at the first decision of a reset          all but the planner
         step              by the user                               all
-        read_all,         by vector environments, in place of step  single, joint
+        read_all,         by vector environments, in place of step  one agent
         read_end, validate
-        _clear            when an episode ends                      AEC, parallel, single
+        masks             by ``action_masks``                       one agent
+        _clear            when an episode ends                      AEC, parallel, single, turn
         check_pending     before a branch or a clone is made        View, planner
         begin_branch      in a new branch or clone                  planner
 
@@ -90,7 +102,8 @@ class View:
     """
 
     in_rounds = False
-    _option = ""  # the option that only this view takes
+    _has_warned_of_losses = False
+    _own_options: tuple[str, ...] = ()  # options that other views refuse
 
     def __init__(self, plan: Plan) -> None:
         """Make the view of a plan, with a new session."""
@@ -134,9 +147,16 @@ class View:
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
-        for option, view in (("flatten", "joint"), ("agent", "single")):
-            if getattr(plan.options, option) and option != cls._option:
-                raise UnknownOptionError(f"{option} is an option of the {view} view only")
+        for option, views in _OWN_OPTIONS.items():
+            if getattr(plan.options, option) and option not in cls._own_options:
+                raise UnknownOptionError(f"{option} is an option of {views} only")
+        for point in plan.active:
+            first = plan.roster.get(point.agent or "", point)
+            if not plan.can_share(point, first):
+                raise AgentError(
+                    f"{first.hook.name} and {point.hook.name} have the same agent {point.agent!r},"
+                    " but their spaces differ; name the agents differently, or use turn_env"
+                )
         return plan
 
     @classmethod
@@ -197,24 +217,10 @@ class View:
     # -- the state --------------------------------------------------------------------------------
 
     @cached_property
-    def _all_observations(self) -> Space:
-        """The space of the observations of all possible agents."""
-        points = self._roster.values()
-        return spaces.Tuple([point.definition.observation_space for point in points])
-
-    @cached_property
     def state_space(self) -> Space | None:
         """The space of ``state()``, if the environment was made with one."""
-        space = self.session.plan.options.state_space
-        if not isinstance(space, str):
-            return space
-        flat = spaces.flatten_space(self._all_observations)
-        if not isinstance(flat, spaces.Box):
-            raise ViewError(
-                'state_space="observations" needs spaces that can be flattened, not'
-                f" {self._all_observations}"
-            )
-        return flat
+        reader: StateReader = self.session.plan.derive(StateReader)
+        return reader.space
 
     def state(self) -> Model:
         """Return the state of the simulation, for centralised critics.
@@ -230,17 +236,7 @@ class View:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
-        if isinstance(self.session.plan.options.state_space, str):
-            observations = [
-                agent.point.blank() if agent.observation is None else agent.observation
-                for agent in self.known_agents()
-            ]
-            value = spaces.flatten(self._all_observations, tuple(observations))
-        else:
-            value = self.session.ask("state")
-        if self.state_space is None:
-            return np.array(value)
-        return observation_cast(self.state_space)(value)
+        return self.session.read_state()
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -353,6 +349,13 @@ class View:
             raise session.refusal()
         with session.exclusive:
             return step(self, action)
+
+    def warn_of_losses(self, episode: EpisodeState) -> None:
+        """Warn once if an episode in rounds has used fewer than nine in ten actions."""
+        problem = "" if episode.round is None else episode.round.explain_losses()
+        if problem and not self._has_warned_of_losses:
+            self._has_warned_of_losses = True
+            warn_user(problem)
 
     def _forget_ended(self) -> None:
         """Forget the records of an episode that has ended."""
@@ -551,6 +554,13 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """
         return self._start(seed, options, self.begin)
 
+    def masks(self) -> list[Mask]:
+        """Return the masks of the actions that are legal now, one for each agent."""
+        return [
+            agent.point.open_mask() if agent.mask is None else agent.mask
+            for agent in self.known_agents()
+        ]
+
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the mask of the legal actions, as ``MaskablePPO`` of sb3-contrib expects it.
 
@@ -571,7 +581,6 @@ class OneAgentView(View, gym.Env[Any, Any]):
                 " MultiDiscrete with flatten=True"
             )
         parts: list[Any] = []
-        for agent in self.known_agents():
-            mask = agent.point.open_mask() if agent.mask is None else agent.mask
+        for mask in self.masks():
             parts += mask if isinstance(mask, tuple) else (mask,)
         return np.concatenate(parts).astype(np.bool_)

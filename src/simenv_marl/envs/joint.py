@@ -8,7 +8,10 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core import (
+    MASK,
     Action,
+    ActionCode,
+    Agent,
     EpisodeState,
     Info,
     Observation,
@@ -16,6 +19,7 @@ from ..core import (
     Space,
     checked_actions,
     duplicate,
+    preferences,
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE, optional_method
@@ -44,7 +48,15 @@ class Joint:
         self._flatten = plan.options.flatten
         if not self._flatten:
             return
-        self.observation_space = _concatenate(observations.values())
+        flat = {name: _flat(space) for name, space in observations.items()}
+        self._flat_observations = {name for name in flat if flat[name] is not observations[name]}
+        self.observation_space = _concatenate(flat.values())
+        # Where agents with a Discrete stand beside agents with a Box.
+        self._codes: dict[str, ActionCode] = {}
+        if any(isinstance(space, spaces.Box) for space in actions.values()):
+            for name, space in actions.items():
+                if isinstance(space, spaces.Discrete):
+                    actions[name], self._codes[name] = preferences(space)
         self.action_space = _concatenate(actions.values(), discrete=True)
         # The index of each agent's action in the flattened one.
         self._places: dict[str, int | slice] = {}
@@ -56,15 +68,15 @@ class Joint:
 
     def actions(
         self,
-        episode: EpisodeState,
+        agents: Mapping[str, Agent | None],
         action: Action,
     ) -> dict[str, Action]:
-        """Return the actions of the live agents.
+        """Return the actions of live agents, given by name. None: it has not appeared yet.
 
         Raises:
             InvalidActionError: The action lacks one, or has another form.
         """
-        live = [name for name in self.roster if name in episode.agents]
+        live = [name for name in self.roster if name in agents]
         if action is RULE:
             return dict.fromkeys(live, RULE)
         if self._flatten:
@@ -73,7 +85,12 @@ class Joint:
                     f"the joint action {short_repr(action)} is not in"
                     f" {short_repr(self.action_space)}; with flatten=True, it is a NumPy array"
                 )
-            return {name: action[self._places[name]] for name in live}
+            parts = {name: action[self._places[name]] for name in live}
+            for name in self._codes.keys() & parts.keys():
+                agent = agents[name]
+                mask = None if agent is None else agent.mask
+                parts[name] = self._codes[name].decode(parts[name], mask)
+            return parts
         if not isinstance(action, Mapping) or set(action) != set(self.roster):
             keys = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
@@ -87,30 +104,41 @@ class Joint:
 
         An agent that has ended keeps its last observation. The reward is the sum of all rewards.
         """
-        observations = {}
-        acted = {}
-        masks = {}
         used = () if episode.round is None else episode.round.acted
-        for name in self.roster:
-            agent = episode.agents.get(name) or episode.ended[name]
-            observations[name] = agent.hand_out()
-            acted[name] = name in used
-            if agent.mask is not None:
-                masks[name] = duplicate(agent.mask)
+        observation, info = self.see(
+            [episode.agents.get(name) or episode.ended[name] for name in self.roster]
+        )
         pending = episode.pending
-        info: Info = {"deciding": "" if pending is None else pending.name, "acted": acted}
-        if masks:
-            info["action_mask"] = masks
+        info["deciding"] = "" if pending is None else pending.name
+        info["acted"] = {name: name in used for name in self.roster}
         if episode.clock is not None:
             info |= episode.clock.read(before)
-        reward = 0.0
-        for agent in (*episode.just_ended, *episode.agents.values()):
-            reward += agent.reward
+        reward = episode.earned
+        if reward is None:
+            reward = 0.0
+            for agent in (*episode.just_ended, *episode.agents.values()):
+                reward += agent.reward
+        return observation, reward, episode.terminated, episode.truncated, info
+
+    def see(self, agents: Sequence[Agent | None]) -> tuple[Observation, Info]:
+        """Return the observation of the agents of the roster, and an info with their masks.
+
+        None in place of an agent that has not appeared.
+        """
+        observations = {}
+        masks = {}
+        for (name, point), agent in zip(self.roster.items(), agents, strict=True):
+            observations[name] = point.blank() if agent is None else agent.hand_out()
+            if agent is not None and agent.mask is not None:
+                masks[name] = duplicate(agent.mask)
         joined: Observation = observations
         if self._flatten:
+            for name in self._flat_observations:
+                space = self.roster[name].definition.observation_space
+                observations[name] = spaces.flatten(space, observations[name])
             parts = list(observations.values())
             joined = np.concatenate(parts).astype(self.observation_space.dtype)
-        return joined, reward, episode.terminated, episode.truncated, info
+        return joined, {MASK: masks} if masks else {}
 
 
 class SimulationJointEnv(OneAgentView):
@@ -125,12 +153,14 @@ class SimulationJointEnv(OneAgentView):
         observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``:
             one-dimensional ``Box`` spaces, which concatenate the spaces of the agents (the paper's
             two-dimensional action space). ``Discrete`` and one-dimensional ``MultiDiscrete`` action
-            spaces become one ``MultiDiscrete``.
+            spaces become one ``MultiDiscrete``. Beside a ``Box``, a ``Discrete`` action becomes a
+            preference in [-1, 1] for each of its actions (the largest legal one is taken), and a
+            ``Discrete`` observation a vector of 0 and 1.
         joint: The agents, combined into one.
     """
 
     in_rounds = True
-    _option = "flatten"
+    _own_options = ("flatten", "state_in_info")
     _agent_name = "joint"
     _last_time: float | None = None  # the time of the previous reset or step
 
@@ -186,7 +216,7 @@ class SimulationJointEnv(OneAgentView):
         episode = self.session.episode
         if episode is None or (self._lock and not self._lock.held):
             return self._step_in_lock(SimulationJointEnv.step, action)
-        episode.step(self.joint.actions(episode, action))
+        episode.step(self.joint.actions(episode.agents, action))
         if self._shows:
             self.show_step()
         return self.read(episode)
@@ -200,7 +230,12 @@ class SimulationJointEnv(OneAgentView):
     def read(self, episode: EpisodeState) -> StepResult:
         """Return the results of a step."""
         results = self.joint.read(episode, self._last_time)
-        self._last_time = results[-1].get("time")
+        info = results[-1]
+        self._last_time = info.get("time")
+        if self.session.plan.options.state_in_info:
+            info["state"] = self.state()
+        if episode.over:
+            self.warn_of_losses(episode)
         return results
 
     @classmethod
@@ -215,13 +250,18 @@ class SimulationJointEnv(OneAgentView):
         episode = self.episode
         if episode.pending is None:
             return {}
-        actions = self.joint.actions(episode, action)
+        actions = self.joint.actions(episode.agents, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError(
                 "RULE is not an action in vector environments; use joint_env, or policies="
             )
         checked_actions(episode, actions)
         return actions
+
+
+def _flat(space: Space) -> Space:
+    """Return a ``Discrete`` as the vector that Gymnasium flattens it to. Others stay."""
+    return spaces.flatten_space(space) if isinstance(space, spaces.Discrete) else space
 
 
 def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
@@ -236,7 +276,7 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
     for space in parts:
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
-                "flatten=True needs one-dimensional Box spaces, and actions that are all"
-                f" continuous or all discrete, not {space}"
+                "flatten=True needs one-dimensional Box and Discrete spaces, or actions that are"
+                f" all discrete, not {space}"
             )
     return spaces.flatten_space(spaces.Tuple(parts))

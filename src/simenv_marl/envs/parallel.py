@@ -10,9 +10,7 @@ from ..core import (
     EpisodeState,
     Info,
     Observation,
-    Round,
 )
-from ..errors import warn_user
 from ..simulation import Sentinel
 from .agents import AgentsView
 from .base import ResetOptions
@@ -42,7 +40,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
     """
 
     in_rounds = True
-    _warned_of_unused_actions = False
 
     def reset(
         self,
@@ -95,23 +92,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         is_over = episode.pending is None and episode.over
         self.agents = [] if is_over else list(episode.agents)
         results = self.begin(episode)
-        if is_over and episode.round is not None:
-            self._warn_of_unused_actions(episode.round)
+        if is_over:
+            self.warn_of_losses(episode)
         if self._shows:
             self.show_step()
         return results
-
-    def _warn_of_unused_actions(self, played: Round) -> None:
-        """Warn once if an episode has used fewer than nine in ten actions."""
-        if self._warned_of_unused_actions or 10 * played.unused <= played.given:
-            return
-        self._warned_of_unused_actions = True
-        warn_user(
-            f"of {played.given} actions in this episode, {played.given - played.unused} were used:"
-            " the agents do not decide in each round, and the other actions are lost. aec_env loses"
-            " none; joint_env gives one controller all of them;"
-            ' infos[agent]["acted"] tells which were used'
-        )
 
     def begin(self, episode: EpisodeState) -> Results:
         """Return the results of a reset or a step, by agent."""

@@ -60,7 +60,7 @@ class SimulationEnv(OneAgentView):
         own_agent: The agent, during an episode.
     """
 
-    _option = "agent"
+    _own_options = ("agent",)
 
     def set_up(self) -> None:
         """Find the agent."""

@@ -40,11 +40,13 @@ from ..simulation import RULE, check_count
 from .base import OneAgentView, ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
-from .vector_batch import Infos, SimulationBatch, make_batch
+from .turn import SimulationTurnEnv
+from .vector_batch import Infos, SimulationBatch, StackedView, make_batch
 
-VIEWS: Final[Mapping[str, type[SimulationEnv | SimulationJointEnv]]] = {
+VIEWS: Final[Mapping[str, type[StackedView]]] = {
     "single": SimulationEnv,
     "joint": SimulationJointEnv,
+    "turn": SimulationTurnEnv,
 }
 """The views that can be stepped together."""
 
@@ -123,7 +125,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         kind = VIEWS.get(view)
         if kind is None:
             raise OptionValueError(
-                f'view must be None, "single" or "joint", not {short_repr(view)}'
+                f'view must be None, "single", "joint" or "turn", not {short_repr(view)}'
             )
         if kind.in_rounds and not plan.complete:
             first = kind(plan)  # finds all agents
@@ -137,7 +139,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         # Whether each action of the action space is legal, at any time.
-        self._checks_spaces_only = not kind.in_rounds and plan.active[0].legal is None
+        self._checks_spaces_only = kind is SimulationEnv and plan.active[0].legal is None
         self._begun = False
         # Whether the next episode of each simulation begins with the next step or reset.
         self._ended = np.zeros(self.num_envs, np.bool_)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -29,6 +29,10 @@ from ..many.batch import step_all
 from .base import ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
+from .turn import SimulationTurnEnv
+
+StackedView: TypeAlias = SimulationEnv | SimulationJointEnv | SimulationTurnEnv
+"""The views that can be stepped together."""
 
 Infos = list[tuple[int, Info]]
 """Infos with the numbers of their sub-environments. They must be merged in this order."""
@@ -48,7 +52,7 @@ class SimulationBatch:
     def __init__(
         self,
         plan: Plan,
-        view: type[SimulationEnv | SimulationJointEnv],
+        view: type[StackedView],
         space: Space,
         mode: AutoresetMode,
         part: range,

@@ -282,9 +282,9 @@ def evaluate(
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict
             from column to callable. A metric returns a number, a string or None.
         team: A callable that combines the returns of an episode's agents into the team's value.
-            None: their sum. It gets a pandas ``Series`` by agent (``max``, or ``lambda returns:
-            returns["waterer_0"]``). Agents that never decided are missing there
-            (``returns.get("waterer_0", 0.0)``).
+            None: their sum, or the total of ``team_reward=``. It gets a pandas ``Series`` by agent
+            (``max``, or ``lambda returns: returns["waterer_0"]``). Agents that never decided are
+            missing there (``returns.get("waterer_0", 0.0)``).
         confidence: The confidence level of the intervals.
         width: Stop as soon as the interval of every difference from the baseline (without a
             baseline: of every mean) is at most this wide; ``seeds`` are then the seeds that may be

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from math import nan
@@ -69,10 +69,12 @@ class Outcome:
         agents: For each agent that has decided, its ``return`` (undiscounted), ``length`` (the
             number of its decisions) and ``fallbacks`` (the number that its fallback answered).
         metrics: The result of each metric.
+        team: What the team has earned, by ``team_reward=``. None without it.
     """
 
     agents: dict[str, dict[str, float]]
     metrics: dict[str, Value]
+    team: float | None = None
 
 
 Result = Outcome | str
@@ -208,7 +210,7 @@ class Runner:
 
         def finish(place: int, episode: Episode) -> Callable[[], None]:
             seed = seeds[place]
-            outcome = tally.outcomes.pop(seed)
+            outcome = replace(tally.outcomes.pop(seed), team=episode.total)
             if episode.fault:
                 return partial(report, seed, f"the numbers are wrong: {episode.fault}")
             if TEAM in outcome.agents:
@@ -257,6 +259,8 @@ class Runner:
             name: sum(own[name] for own in agents.values())
             for name in ("return", "length", FALLBACKS)
         }
+        if result.team is not None:
+            total["return"] = result.team
         if self._team is not None:
             returns = Series({name: own["return"] for name, own in agents.items()}, dtype=float)
             try:

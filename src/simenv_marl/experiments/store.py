@@ -168,7 +168,7 @@ class Store:
         run = Run(row, entry["contender"], entry["seed"])
         result: Result = entry["error"]
         if entry["status"] == "ok":
-            result = Outcome(entry["agents"], entry["metrics"])
+            result = Outcome(entry["agents"], entry["metrics"], entry.get("team"))
             if row in self._rows and run.contender not in self.samples:
                 self._parts[run.contender] = _comparable_parts(entry["provenance"])
                 self.samples[run.contender] = row

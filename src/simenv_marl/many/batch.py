@@ -29,6 +29,7 @@ from ..core import (
     AskingPolicy,
     DeferredPolicy,
     Episode,
+    EpisodePolicy,
     Info,
     Plan,
     Point,
@@ -40,7 +41,10 @@ from ..core import (
     is_asked_alone,
     reuse_resources,
     split_batch,
+    stacked,
     stacker,
+    takes_info,
+    takes_state,
     two_arguments,
 )
 from ..core import Answers as PendingAnswers
@@ -62,14 +66,21 @@ class BatchPolicy:
         keys: The keys of ``policies`` that have this policy.
         policy: The policy, a callable of observations and infos.
         takes_identities: Whether it takes the identities of the decisions, after the infos.
+        takes_state: Whether it takes the states of the simulations.
         alone: Whether it answers one decision at a time.
     """
 
     def __init__(self, policy: Callable[..., Action], *, alone: bool = False) -> None:
         self.keys: list[object] = []
-        self.policy: Callable[..., Action] = two_arguments(policy)
+        self.takes_state = takes_state(policy)
+        takes_stacks = self.takes_state and not (alone or is_asked_alone(policy))
+        self.policy: Callable[..., Action] = policy if takes_stacks else two_arguments(policy)
         self.takes_identities = self.policy is policy and takes_identities(policy)
-        self.alone = alone or isinstance(self.policy, AskingPolicy)
+        self._places = 2 + self.takes_identities
+        if takes_stacks and not takes_info(policy):
+            self._places = 1
+        is_asked = isinstance(self.policy, EpisodePolicy) and not self.policy.batched
+        self.alone = alone or is_asked
         self._groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
@@ -80,6 +91,7 @@ class BatchPolicy:
         observations: Observation,
         infos: Sequence[Info],
         identities: Sequence[object],
+        states: object,
     ) -> Action:
         """Call the policy with as many of the arguments as it takes, and return its result.
 
@@ -87,9 +99,10 @@ class BatchPolicy:
             observations: Stacked observations, of shape ``(batch, *shape)``.
             infos: An info for each.
             identities: The seed of the episode and the number of the decision, for each.
+            states: The stacked states, if it takes them.
         """
-        more = (identities,) if self.takes_identities else ()
-        return self.policy(observations, infos, *more)
+        seen = (observations, infos, identities)[: self._places]
+        return self.policy(*seen, _state=states) if self.takes_state else self.policy(*seen)
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
@@ -118,6 +131,9 @@ class PolicyKey(DeferredPolicy):
     def __init__(self, place: int, batch_policy: BatchPolicy) -> None:
         self.place = place
         self.batch_policy = batch_policy
+        policy = batch_policy.policy
+        self.takes_state = batch_policy.takes_state
+        self.looks_back = isinstance(policy, EpisodePolicy) and policy.looks_back
 
     def answer(
         self,
@@ -128,7 +144,10 @@ class PolicyKey(DeferredPolicy):
     ) -> Action:
         """Answer one decision at once."""
         if self.batch_policy.alone:
-            return self.batch_policy.policy(observation, info)
+            policy = self.batch_policy.policy
+            if isinstance(policy, EpisodePolicy):
+                return policy.respond(episode, agent, observation, info)
+            return policy(observation, info)
         group = self.batch_policy.group(agent.point)
         actions, _ = group.ask([episode], [observation], [info])
         return actions[0]
@@ -207,8 +226,15 @@ class Group:
             identities = [(episode.seed, episode.turns) for episode in episodes]
         number = len(episodes)
         try:
-            stack = self.stack(observations)
-            answers = policy.answers(stack, infos, identities)
+            states = None
+            if policy.takes_state:
+                states = stacked([episode.note_states().read() for episode in episodes])
+            if isinstance(policy.policy, EpisodePolicy):
+                agents = [episode.deciding for episode in episodes]
+                answers = policy.policy.respond_to_many(agents, infos, states)
+            else:
+                stack = self.stack(observations)
+                answers = policy.answers(stack, infos, identities, states)
             return read_answers(answers, policy, number)
         except BaseException as error:
             noun = "seed" if number == 1 else "seeds"

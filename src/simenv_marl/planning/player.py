@@ -16,6 +16,7 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from ..core import (
     ILLEGAL,
+    MASK,
     Agent,
     Episode,
     EpisodePolicy,
@@ -31,7 +32,13 @@ from ..core import (
     policy_for,
     two_arguments,
 )
-from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
+from ..envs import (
+    SimulationAECEnv,
+    SimulationEnv,
+    SimulationJointEnv,
+    SimulationParallelEnv,
+    SimulationTurnEnv,
+)
 from ..errors import (
     EpisodeOverError,
     InvalidActionError,
@@ -87,6 +94,11 @@ class Player:
 
     # -- checks, before anything moves ------------------------------------------------------------
 
+    @property
+    def mask(self) -> Mask | None:
+        """The mask of the pending decision. None if all actions are legal."""
+        return self.agent.mask
+
     def candidates(
         self,
         actions: Iterable[Action] | None,
@@ -116,7 +128,7 @@ class Player:
                 "actions must be a list of candidates, or None for all legal actions of a"
                 f" Discrete, not {short_repr(actions)}; the action space is {short_repr(space)}"
             )
-        mask = self.agent.mask
+        mask = self.mask
         for action in actions:
             self._check(action, None if legal else mask)
         candidates = [action for action in actions if not legal or self.allows(action)]
@@ -129,7 +141,7 @@ class Player:
     def allows(self, action: Action) -> bool:
         """Return whether an action is legal now."""
         try:
-            self._check(action, self.agent.mask)
+            self._check(action, self.mask)
         except InvalidActionError:
             return False
         return True
@@ -319,7 +331,7 @@ class JointPlayer(Player):
         mask: Mask | None,
     ) -> None:
         if self._space_of(self.name) == self.view.action_space:
-            checked_actions(self.episode, self.view.joint.actions(self.episode, action))
+            checked_actions(self.episode, self.view.joint.actions(self.episode.agents, action))
         elif action is not RULE:
             samples = self._samples(action, self.name)
             if samples:
@@ -335,6 +347,62 @@ class JointPlayer(Player):
             name: self._decide_for(name) if name in agents else RULE
             for name in self.view.joint.roster
         }
+
+
+class TurnPlayer(Player):
+    """The learner of a turn view, which decides for each agent. ``agent`` decides now."""
+
+    view: SimulationTurnEnv
+
+    def __init__(
+        self,
+        env: Environment,
+        base: Policy,
+    ) -> None:
+        super().__init__(env, base, "all agents")
+        info: Info = {"agent": self.agent.name}
+        if self.view.turn.has_masks:
+            info[MASK] = self.mask
+        self.latest = {self.name: (self.view.turn.observe(self.agent), info)}
+        if isinstance(base, Mapping) and self._space_of(self.name) != self.view.action_space:
+            raise OptionValueError(
+                "a base by agent needs a turn view whose action space no wrapper has replaced; pass"
+                " one policy for all agents"
+            )
+
+    @property
+    def mask(self) -> Mask | None:
+        """The mask of the learner's actions. None: nothing can be masked."""
+        return self.view.turn.mask(self.agent)
+
+    def _check(
+        self,
+        action: Action,
+        mask: Mask | None,
+    ) -> None:
+        space = self._space_of(self.name)
+        # Where masks do not count, an action of the largest ``Discrete`` may be another agent's.
+        is_open = mask is None and not isinstance(space, spaces.Box)
+        if action is RULE or is_open or space != self.view.action_space:
+            super()._check(action, mask)
+        else:
+            self.view.validate(action)
+
+    def step(self, action: Action) -> float:
+        """Take an action, run to the next decision of any agent, and return the reward."""
+        reward = super().step(action)
+        self.agent = self.view.own_agent
+        return reward
+
+    def decide(self) -> Action:
+        """Return the learner's action by the base."""
+        if not isinstance(self.base, Mapping):
+            return super().decide()
+        action = self._decide_for(self.agent.name)
+        if action is not RULE:
+            code = self.view.turn.seats[self.agent.point.hook].code
+            action = code.encode(self.agent.validate(action))
+        return action
 
 
 class AECPlayer(Player):
@@ -414,4 +482,6 @@ def player_of(
             return ParallelPlayer(env, base)
         case SimulationJointEnv():
             return JointPlayer(env, base)
+        case SimulationTurnEnv():
+            return TurnPlayer(env, base)
     return Player(env, base)

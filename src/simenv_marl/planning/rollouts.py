@@ -235,7 +235,8 @@ def action_values(
     Args:
         env: An environment of one simulation with a pending decision, in any view, with or without
             wrappers. In the parallel view, the agent is the one that is ``"deciding"``, and the
-            others play the same rounds. In the joint view, one agent acts for all.
+            others play the same rounds. In the joint view, one agent acts for all. In the turn
+            view, one learner does, and its decisions are the steps.
         actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
             ``Discrete``.
         base: The policy that decides after the candidate: ``RULE``, a callable of the observation,

@@ -15,7 +15,7 @@ from time import perf_counter
 from typing import Any, ClassVar, Final
 
 from ..core import branch, clone, pending_view
-from ..envs import SimulationJointEnv
+from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..errors import BranchError, OptionValueError
 from .rollouts import (
     BEGIN,
@@ -76,13 +76,13 @@ class Tree(Rollouts):
         """Begin to keep checkpoints, if there is one exact future and they save time.
 
         A checkpoint spares a try half of the depth in the mean, and costs a fork. Processes of
-        clones have neither the wrappers of an environment nor the infos of joint views.
+        clones have neither the wrappers of an environment nor the infos of joint or turn views.
         """
         policy = self.policy
         if self.reseeds or policy.method == "replay" or policy.depth == 1:
             return None
         view = pending_view(self.env, "planning")
-        if view is not self.env or isinstance(view, SimulationJointEnv):
+        if view is not self.env or isinstance(view, (SimulationJointEnv, SimulationTurnEnv)):
             return None
         began = perf_counter()
         try:

@@ -80,7 +80,7 @@ _TESTS: Final = (
             view,
             lambda make: check_env(make(), skip_render_check=True),
         )
-        for view in ("single", "joint")
+        for view in ("single", "joint", "turn")
     ),
 )
 """The tests and their views; each test is called with a factory of environments."""

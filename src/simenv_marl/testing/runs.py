@@ -339,8 +339,8 @@ class Runner:
 
     def make_environment(self, view: str, **options: Any) -> Any:
         """Make an environment with changed options."""
-        if view != "joint" and self.plan.options.flatten:
-            options["flatten"] = False
+        if view not in ("joint", "turn"):  # the others refuse these options
+            options |= {"flatten": False, "state_in_info": False}
         plan = self.plan.amended(options)
         return VIEWS[view](plan)
 

@@ -25,9 +25,9 @@ from ..episodes.agent import Agent, Clock
 from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
 from ..episodes.episode import Episode
 from ..episodes.events import PointHandler
-from ..episodes.round import Round
 from ..episodes.session import Session
 from ..episodes.state import EpisodeState, Outcome, State
+from ..episodes.steps import Round
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection
@@ -41,6 +41,7 @@ Result = TypeVar("Result")
 
 FIELDS: Final = (
     "observation", "reward", "info", "mask", "decided", "ended", "present", "answered", "delegated",
+    "noted_action",
 )  # fmt: skip
 """The fields of an agent that views read."""
 
@@ -64,6 +65,7 @@ class Report(NamedTuple):
     time: float | None
     agents: list[tuple[str, int, tuple[Any, ...]]]
     pending: str | None
+    earned: float | None
     unreported_end: bool
 
 
@@ -88,12 +90,13 @@ class Mirror(EpisodeState):
         self.unreported_end = report.unreported_end
         self.outcome = report.outcome
         self.turns = report.turns
+        self.earned = report.earned
         self.round = report.round
         self._time[0] = report.time
         self.just_ended = []
         for name, point, fields in report.agents:
             agent = self.agent(name)
-            if agent is None:
+            if agent is None or agent.point is not self.plan.points[point]:
                 handler = PointHandler(self.plan.points[point])
                 agent = Agent(name, handler, None, False, self.clock, None)
             agent.load(dict(zip(FIELDS, fields, strict=True)))
@@ -150,6 +153,7 @@ class Host:
     def __init__(self, view: HostedView) -> None:
         self._view = view
         self._reported: Episode | None = None  # all its agents were reported
+        self._latest: Agent | None = None  # was pending at the latest report
 
     def begin(self, separate: Callable[[], None]) -> bytes:
         """In a fork, leave the parent. Let the view of a planner wait for its agent only."""
@@ -173,6 +177,9 @@ class Host:
             agents += episode.agents.values()
         elif pending is not None:
             agents.append(pending)
+            if self._latest is not None and self._latest.noted_action is not None:
+                agents.append(self._latest)  # because the turn view reads the rule's action
+        self._latest = pending
         self._reported = episode
         if not episode.in_rounds:
             episode.take_ended()  # because the view in the other process reports them
@@ -185,6 +192,7 @@ class Host:
             None if episode.clock is None else float(episode.clock.time()),
             [(agent.name, hooks.index(agent.point.hook), _fields(agent)) for agent in agents],
             None if pending is None else pending.name,
+            episode.earned,
             episode.unreported_end,
         )
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import exp, isfinite
-from numbers import Real
+from math import exp
 from typing import Any, Protocol
 
 import numpy as np
 from greenlet import getcurrent
 
-from ...errors import AgentError, MaskError, RewardError, short_repr
+from ...errors import AgentError, InvalidActionError, MaskError
 from ...hooks.hook import Hook
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
@@ -20,6 +19,7 @@ from ..plans.point import Args, Kwargs, Point, Policy
 from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
+from ..values.rewards import checked_reward
 from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
 from .decision import Decision
@@ -70,6 +70,7 @@ class RunningEpisode(Protocol):
     others: dict[str, Agent]
     ended: dict[str, Agent]
     called: set[Hook]
+    moved: set[str]
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision where more than an update is due."""
@@ -82,6 +83,9 @@ class RunningEpisode(Protocol):
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent."""
+
+    def note_first_decision(self) -> None:
+        """Note that an agent decides for the first time."""
 
     def finish(self, *, truncated: bool) -> None:
         """End the episode of all live agents."""
@@ -115,6 +119,7 @@ class Agent:
         choices: The choices of the pending decision. None without ``choices=``.
         offered: The choices of the latest decision, held weakly, until the rule has chosen.
         rule_action: The action that corresponds to the rule's latest decision. None if unknown.
+        noted_action: The same until an info contains it. None where infos do not.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         ended: Whether its episode has ended before the simulation's.
         present: Whether the latest info comes from an observation.
@@ -145,7 +150,7 @@ class Agent:
     choices: list[Model] | None = None
     offered: list[Model] | None = None
     rule_action: Action = None
-    _has_rule_action: bool = False  # which the next info contains
+    noted_action: Action = None
     decided: bool = False
     _is_quick: bool = False  # an update needs no more than an observation and a reward
     ended: bool = False
@@ -190,6 +195,8 @@ class Agent:
             return episode.decide(self, args, kwargs)
         try:
             if DIFFERENCES or not self._is_quick:
+                if not self.decided:
+                    episode.note_first_decision()
                 self.update(args, kwargs)
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
@@ -212,6 +219,17 @@ class Agent:
             raise
         return self
 
+    def move_to(self, handler: DecisionHandler) -> None:
+        """Let it decide at another point from now on."""
+        self.raw_observation = self.observation  # read in the space of the point so far
+        self.handler = handler
+        self.point = point = handler.point
+        self.arguments = Arguments(point)
+        self.mask = None
+        self.choices = None
+        informs = point.definition.rule_action_mapping is not None
+        self._is_quick = self.decided and point.legal is None and not informs
+
     def refusal(self) -> AgentError:
         """Make the error for a decision after the end of its episode."""
         return AgentError(
@@ -220,9 +238,22 @@ class Agent:
             " when its entity is gone"
         )
 
+    @property
+    def place(self) -> str:
+        """Its name and its decision point, for the notes of errors."""
+        return f"of {self.name!r} at {self.point.hook.name}"
+
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision: see ``Point.validate``."""
         return self.point.validate(action, self.name, self.mask)
+
+    def allows(self, action: Action) -> bool:
+        """Return whether an action is legal for the pending decision."""
+        try:
+            self.validate(action)
+        except InvalidActionError:
+            return False
+        return True
 
     def only_action(self) -> Action:
         """Return the only legal action of the pending decision. None if there are several."""
@@ -392,9 +423,9 @@ class Agent:
         mask = self.mask
         if mask is not None:
             self.info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
-        if self._has_rule_action:
-            self.info["rule_action"] = self.rule_action
-            self._has_rule_action = False
+        if self.noted_action is not None:
+            self.info["rule_action"] = self.noted_action
+            self.noted_action = None
         if point.masked_parts and mask is not None:
             self.observation = point.observe(args, kwargs, mask)
         else:
@@ -487,6 +518,10 @@ class Agent:
         self.reward = 0.0 if carry_on else total
         self._carried = total if carry_on else 0.0
 
+    def pay(self, reward: float) -> None:
+        """Set the reward to the team's."""
+        self.reward = reward
+
     # -- infos ------------------------------------------------------------------------------------
 
     def read_clock(self) -> None:
@@ -498,7 +533,7 @@ class Agent:
     def note_rule_action(self, action: Action, informs: bool) -> None:
         """Note the action that corresponds to the rule's decision."""
         self.rule_action = action
-        self._has_rule_action = informs
+        self.noted_action = action if informs else None
         self.offered = None
 
     def take_rule_action(self) -> Action:
@@ -562,17 +597,3 @@ class Agent:
             self._numbers = observation.tobytes()
             return observation
         return duplicate(self.observation)
-
-
-def checked_reward(name: str, reward: Model) -> float:
-    """Return a reward as a float. Raise a ``RewardError`` if it is not one finite number."""
-    value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
-    if not isinstance(value, (Real, np.bool_)):
-        raise RewardError(f"the reward {short_repr(reward)} is not one number")
-    try:
-        number = float(value)
-    except OverflowError:
-        raise RewardError(f"the reward {short_repr(reward)} is too large for a float") from None
-    if not isfinite(number):
-        raise RewardError(f"the reward of {name!r} is {number}, which is not finite")
-    return number

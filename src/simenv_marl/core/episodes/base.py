@@ -4,23 +4,36 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from ...errors import OptionValueError, SimEnvError, annotate, short_repr
-from ...simulation import Action, Model, Observation
+from ...errors import (
+    AgentError,
+    OptionValueError,
+    SimEnvError,
+    ViewError,
+    annotate,
+    short_repr,
+)
+from ...simulation import RULE, Action, Model, Observation
 from ..plans.plan import Plan
+from ..plans.point import Point, Policy, Space
+from ..plans.points import resolve_roster
 from ..plans.policies import Where
-from ..switching.context import ExclusiveLock
+from ..switching.context import ExclusiveLock, environment_context
 from ..switching.driver import WAIT
 from ..switching.generators import is_seed
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
-from .state import EpisodeState, State
+from ..values.spaces import observation_cast
+from ..values.stacking import stacked, stacker
+from .events import Handlers
+from .state import EpisodeState, State, UnmatchedNames
 
 ResetOptions = dict[str, Any] | None
 """The options of a ``reset``."""
@@ -74,6 +87,19 @@ class Replay:
     def answer(self) -> Action:
         """Return the next answer. ``WAIT`` where the other episode stands."""
         return self.answers.popleft() if self.answers else WAIT
+
+
+class EpisodeOwner(Protocol):
+    """The session, as its episodes use it."""
+
+    plan: Plan
+    where: Where
+    handlers: Handlers
+    context: Callable[..., environment_context]
+    unmatched_names: UnmatchedNames
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation."""
 
 
 @dataclass(eq=False, repr=False, slots=True, weakref_slot=True)
@@ -184,6 +210,11 @@ class BaseSession(ABC):
     def ask(self, name: str, *args: Any) -> Model:
         """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
 
+    def read_state(self) -> Model:
+        """Return the state of the simulation: see ``StateReader``."""
+        reader: StateReader = self.plan.derive(StateReader)
+        return reader.read(self)
+
     def declare(self, plan: Plan) -> None:
         """Forget the episode that has shown the agents, and take over a plan that declares them."""
         raise NotImplementedError
@@ -207,6 +238,89 @@ class BaseSession(ABC):
     @abstractmethod
     def leave_caller(self) -> None:
         """In a branch that was forked from inside a policy, leave the step that has asked it."""
+
+
+class StateReader:
+    """Reads the states of the simulations of a plan, for centralised critics.
+
+    With ``state_space="observations"``, these are the latest observations of all agents that the
+    user answers or, without a user, of all whom policies answer.
+
+    Attributes:
+        space: The space of the states. None: arrays of any shape.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Find out the space.
+
+        Raises:
+            OptionValueError: Observations are the state, and not all agents are known.
+            ViewError: These observations cannot be flattened.
+        """
+        space = plan.options.state_space
+        self._roster: Mapping[str, Point] | None = None
+        self._unanswered: tuple[Policy, ...] = ()  # policies of agents that the roster omits
+        if isinstance(space, str):
+            self._roster = roster = plan.roster if plan.has_user else self._answered(plan)
+            parts = [point.definition.observation_space for point in roster.values()]
+            self._whole = spaces.Tuple(parts)
+            space = spaces.flatten_space(self._whole)
+            if not isinstance(space, spaces.Box):
+                raise ViewError(
+                    'state_space="observations" needs spaces that can be flattened, not'
+                    f" {self._whole}"
+                )
+        self.space: Space | None = space
+        self._cast = np.array if space is None else observation_cast(space)
+
+    def read(self, session: BaseSession) -> Model:
+        """Return the present state as a new array, or as an element of the space.
+
+        Raises:
+            NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
+            ResetNeededError: There is no episode to observe.
+            AgentError: An agent that policies answer was not declared.
+        """
+        if self._roster is None:
+            return self._cast(session.ask("state"))
+        episode = session.episode
+        if episode is None:
+            raise session.refusal()
+        found = {**episode.others, **episode.ended, **episode.agents}
+        observations = []
+        for name, point in self._roster.items():
+            observation = found.pop(name).observation if name in found else None
+            observations.append(point.blank() if observation is None else observation)
+        for name, agent in found.items():
+            if self._unanswered and agent.policy not in self._unanswered:
+                raise AgentError(
+                    'state_space="observations" needs to know all agents beforehand;'
+                    f" possible_agents= lacks {name!r}"
+                )
+        return self._cast(spaces.flatten(self._whole, tuple(observations)))
+
+    def stack(self, states: Sequence[Model]) -> Any:
+        """Stack states. Without any, return a stack without rows."""
+        if self.space is None:
+            return stacked(states) if states else np.zeros(0)
+        return stacker(self.space)(states)
+
+    def _answered(self, plan: Plan) -> Mapping[str, Point]:
+        """Return the decision points of the agents that policies answer, by agent."""
+        self._unanswered = None, RULE, plan.subject.default_policy
+        points = list(plan.points)
+        known = [point.agent for point in points]
+        roster, complete = resolve_roster(points, plan.options.possible_agents, known)
+        if not complete:
+            raise OptionValueError(
+                'state_space="observations" needs to know all agents beforehand: declare them in'
+                " possible_agents="
+            )
+        return {
+            name: point
+            for name, point in roster.items()
+            if plan.policy_of(name, point) not in self._unanswered
+        }
 
 
 def checked_seed(seed: Any) -> int | None:

@@ -1,13 +1,5 @@
 """One episode of one simulation: the order of events.
 
-An episode::
-
-    MOVING <--------> PENDING --------> OVER
-    the simulation    a decision waits  terminated, truncated,
-    runs, or          for the user      failed or closed
-    mappings and
-    policies do
-
 A decision::
 
     simulation                     episode, on its user's stack
@@ -35,8 +27,9 @@ functions run their rule.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from sys import maxsize
-from typing import Protocol
+from typing import Any
 from weakref import ref
 
 from greenlet import getcurrent
@@ -44,16 +37,7 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import (
-    RULE,
-    TRUNCATED,
-    Action,
-    Function,
-    Model,
-    Sentinel,
-    optional_method,
-)
-from ..plans.plan import Plan
+from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
     AskingPolicy,
@@ -64,26 +48,14 @@ from ..plans.policies import (
     two_arguments,
 )
 from ..switching.context import environment_context
-from ..switching.driver import WAIT, AnyHandler, Driver, Event
+from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
-from .base import LONGEST_TAPE, Replay
-from .decision import Decision
-from .events import Handlers
-from .round import Round
+from .base import LONGEST_TAPE, EpisodeOwner, Replay
 from .split import SplitCall
-from .state import RUNNING, EpisodeState, Outcome, UnmatchedNames, checked_actions, missing_decision
-
-
-class EpisodeOwner(Protocol):
-    """The session, as its episodes use it."""
-
-    plan: Plan
-    where: Where
-    handlers: Handlers
-    context: Callable[..., environment_context]
-    unmatched_names: UnmatchedNames
+from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
+from .steps import Round, StateNotes, Team
 
 
 class Episode(EpisodeState):
@@ -97,14 +69,18 @@ class Episode(EpisodeState):
         called: The functions that end agents and were called.
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
+        memory: The values of policies for all agents.
+        moved: The names of agents that have decided at several points.
+        states: The states that learners have asked for. None if none has.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
         replay: The policy that repeats another episode. None in ordinary episodes.
     """
 
     __slots__ = (
-        "_context", "_expected_calls", "_failed_in_model", "_handlers",
-        "_most_steps", "_plugins", "_split", "_tape_size", "called", "driver", "is_plain", "latest",
-        "replay", "running", "session", "simulation", "tape",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps",
+        "_observes", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
+        "is_plain", "latest", "memory", "moved", "replay", "running", "session", "simulation",
+        "states", "tape",
     )  # fmt: skip
 
     def __init__(
@@ -133,26 +109,24 @@ class Episode(EpisodeState):
         self.running = True
         self._failed_in_model = False
         self._most_steps = plan.options.max_steps or maxsize
-        self.is_plain = not (in_rounds or self.skips)
+        self.memory: dict[object, Any] = {}
+        self.moved: set[str] = set()
+        self._team: Team | None = None
+        if plan.options.team_reward is not None:
+            self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
+        self.is_plain = not (in_rounds or self.skips or self._team)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
+        self._observes = isinstance(plan.options.state_space, str)  # observations are states
+        self.states: StateNotes | None = None
         for name, prepared in self._handlers.roster.items():
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
     def context(self) -> environment_context:
         """Return the context that the environment's code needs."""
         return self._context(self.driver)
-
-    def handlers_by_hook(self) -> dict[Hook, AnyHandler]:
-        """Return the handlers of events: the agent itself where a point has only one."""
-        handlers = dict(self._handlers.by_hook)
-        for agent in self.agents.values():
-            point = agent.point
-            if point.agent is not None and point.split is None:
-                handlers[point.hook] = agent
-        return handlers
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -247,7 +221,7 @@ class Episode(EpisodeState):
                 self.tape.append(recorded)
             self.turns += bool(checked)
             is_last = bool(checked) and self.turns == self._most_steps
-            played.begin(checked)
+            played.begin(checked, pending.name)
             if self.unreported_end:
                 self.unreported_end = False
             else:
@@ -316,8 +290,18 @@ class Episode(EpisodeState):
         if self.turns >= self._most_steps:  # the user has taken the last step
             self.finish(truncated=True)
             return WAIT
+        if not agent.decided:
+            self.note_first_decision()
         agent.update(args, kwargs)
-        return agent.reply_if_forced() if self.skips else agent
+        if self.skips:
+            reply = agent.reply_if_forced()
+            if reply is not agent:
+                if self._team is not None:
+                    self._team.join(agent)
+                return reply
+        if self._team is not None:
+            self.earned = self._team.settle([agent])
+        return agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -327,8 +311,11 @@ class Episode(EpisodeState):
             return agent
         self.latest = agent
         if not agent.decided:  # it acts before it was ever updated
+            self.note_first_decision()
             args, kwargs = agent.arguments.recall()
             agent.update(args, kwargs, observe=False)
+            if self._team is not None:
+                self._team.join(agent)
         return agent.reply_to(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
@@ -369,7 +356,7 @@ class Episode(EpisodeState):
             reply = agent.reply_if_forced()
             if reply is not agent:
                 return reply
-        if isinstance(policy, AskingPolicy):
+        if self._observes or (isinstance(policy, EpisodePolicy) and policy.looks_back):
             agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
@@ -414,10 +401,6 @@ class Episode(EpisodeState):
         self.replay = None
         self.just_ended = []
 
-    def decision_of(self, agent: Agent) -> Decision:
-        """Describe the decision of an agent."""
-        return agent.describe(self.seed, self.where)
-
     def planner_view(self) -> object:
         """Make the environment that a planner gets."""
         return self.plan.subject.planner_view(self.session())
@@ -440,11 +423,6 @@ class Episode(EpisodeState):
 
     # -- agents -----------------------------------------------------------------------------------
 
-    def _make_agent(self, name: str, handler: DecisionHandler) -> Agent:
-        policy = self.plan.policy_of(name, handler.point)
-        delegated = self.plan.is_delegated(policy)
-        return Agent(name, handler, policy, delegated, self.clock, self._plugins)
-
     def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point. Let a new one join.
 
@@ -458,13 +436,20 @@ class Episode(EpisodeState):
             )
         agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
         if agent is None:
-            agent = self._make_agent(name, handler)
-            (self.others if agent.delegated else self.agents)[name] = agent
+            policy = self.plan.policy_of(name, handler.point)
+            delegated = self.plan.is_delegated(policy)
+            agent = Agent(name, handler, policy, delegated, self.clock, self._plugins)
+            (self.others if delegated else self.agents)[name] = agent
         elif agent.handler is not handler:
-            raise AgentError(
-                f"the agent {name!r} decides at {agent.point.hook.name} and at {here}; an agent has"
-                " one decision point: give each point's agents names of their own"
-            )
+            policy = self.plan.policy_of(name, handler.point)
+            if policy is not agent.policy or not self.plan.can_share(agent.point, handler.point):
+                raise AgentError(
+                    f"the agent {name!r} decides at {agent.point.hook.name} and at {here}, whose"
+                    " spaces or policies differ: give each point's agents names of their own, or"
+                    " use turn_env, which unites spaces"
+                )
+            agent.move_to(handler)
+            self.moved.add(name)
         return agent
 
     def blame(self, agent: Agent) -> None:
@@ -476,6 +461,13 @@ class Episode(EpisodeState):
         if self.pending is None and not self.over:
             self.pending = self.latest
 
+    def observe_others(self, agent: Agent) -> None:
+        """Observe all live agents but one, as when a round returns. Reward none."""
+        self._keep_announced(agent, everyone=True)
+        for other in (*self.agents.values(), *self.others.values()):
+            if other is not agent:
+                other.refresh(reward=False)
+
     def update_all(self, *, truncated: bool = False) -> None:
         """Reward and observe the live agents when a reset or a round returns.
 
@@ -484,11 +476,7 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        expected_calls = self._expected_calls
-        if expected_calls is not None:
-            for agent, (args, kwargs) in self._announced(expected_calls).items():
-                if agent is not pending and (in_rounds or not agent.decided):
-                    agent.keep(args, kwargs)
+        self._keep_announced(pending)
         if truncated:
             self.finish(truncated=True)
             return
@@ -502,32 +490,66 @@ class Episode(EpisodeState):
                 agent.carry_reward(not self.turns)
             if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
+        if in_rounds and self._team is not None:
+            self.earned = self._team.settle(self.agents.values())
         self.pending = pending
         self.latest = pending or self.latest
 
-    def _announced(self, expected_calls: Function) -> dict[Agent, tuple[Args, Kwargs]]:
-        """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
-        announced: dict[Agent, tuple[Args, Kwargs]] = {}
-        for plan_point in self.plan.active:
+    def _keep_announced(self, deciding: Agent | None, *, everyone: bool = False) -> None:
+        """Hold the arguments of the calls that ``expected_calls`` announces, one for each agent.
+
+        ``everyone``: also for agents that a policy answers.
+        """
+        expected_calls = self._expected_calls
+        if expected_calls is None:
+            return
+        known = {deciding}
+        for plan_point in self.plan.points if everyone else self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point
             for call in expected_calls(point.hook.name):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
                     agent = None if name is None else self.agent_for(handler, name)
-                    if agent is not None and not agent.delegated:
-                        announced.setdefault(agent, (args, kwargs))
-        return announced
+                    if agent is None or agent in known or agent.ended:
+                        continue
+                    known.add(agent)
+                    is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
+                    if everyone or is_asked:
+                        agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
-        """End the episode of one agent while the simulation's goes on."""
+        """End the episode of one agent while the simulation's goes on.
+
+        An agent that is none of the environment is observed for the last time, if states need it.
+        """
+        is_other = agent.delegated
+        if is_other and not self._observes:
+            return
         latest = self.latest
         self.latest = agent
         agent.conclude()
-        agent.end()
+        if self.states is not None:
+            self.states.note_end(agent)
         self.latest = latest  # the model continues after the decision of this agent
+        if is_other:
+            return
+        agent.end()
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
+        if self._team is not None:
+            self._team.note_end(agent)
+
+    def note_states(self) -> StateNotes:
+        """Return the states that learners ask for, and note further ones."""
+        if self.states is None:
+            self.states = StateNotes(self)
+        return self.states
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation: see ``StateReader``."""
+        session: Any = self.session()
+        return session.read_state()
 
     # -- branches that wait for one agent ---------------------------------------------------------
 
@@ -546,7 +568,7 @@ class Episode(EpisodeState):
         self.just_ended = []
         agent.take_over()
         self.round = None  # it is played in turns from now on
-        self.is_plain = not self.skips
+        self.is_plain = not (self.skips or self._team)
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             args, kwargs = agent.arguments.recall()
             with self.context():
@@ -586,6 +608,9 @@ class Episode(EpisodeState):
         for agent in self.agents.values():
             self.latest = agent
             agent.conclude()
+        if self._team is not None:
+            self.earned = self._team.settle(self.agents.values())
+            self.total = self._team.total
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
         session = self.session()
         if session is not None and (self.plan.named_agents or self.plan.removers):
@@ -599,9 +624,9 @@ class Episode(EpisodeState):
         if agent is None:
             where = "before the first decision"
         elif self._failed_in_model:
-            where = f"in the model, after decision {self.turns}, {_at(agent)}"
+            where = f"in the model, after decision {self.turns}, {agent.place}"
         else:
-            where = f"at decision {self.turns + 1}, {_at(agent)}"
+            where = f"at decision {self.turns + 1}, {agent.place}"
         annotate(error, f"simenv_marl: {where}; seed {self.seed}")
 
     def fail(self, error: BaseException) -> None:
@@ -620,12 +645,6 @@ class Episode(EpisodeState):
                 f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well",
             )
         clear_frames(error)
-
-    def stop(self) -> None:
-        """Note that nothing happens any more."""
-        self.pending = None
-        if self.outcome is RUNNING:
-            self.outcome = Outcome.STOPPED
 
     def is_suspended(self) -> bool:
         """Return whether the simulation must be unwound before the episode ends.
@@ -674,7 +693,3 @@ class Episode(EpisodeState):
             self._fault = f"{type(self.simulation).__name__} {self.driver.given_up}."
             warn_user(self._fault, ResourceWarning)
         return problems
-
-
-def _at(agent: Agent) -> str:
-    return f"of {agent.name!r} at {agent.point.hook.name}"

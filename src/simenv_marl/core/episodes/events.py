@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -135,8 +135,9 @@ class RemovalHandler(Observer):
                 name = _name_of_entity(episode, handler, owner, args)
             named.append((handler, name))
         for handler, name in named:
-            agent = episode.agents.get(name)
-            if agent is not None and handler in (None, agent.handler):
+            agent = episode.agents.get(name) or episode.others.get(name)
+            is_its_own = agent is not None and handler in (None, agent.handler)
+            if agent is not None and (is_its_own or name in episode.moved):
                 episode.end_agent(agent)
             elif handler is None and name is not None and not self._has_warned:
                 known = [*episode.agents, *episode.others, *episode.ended]
@@ -252,11 +253,18 @@ class Handlers:
         by_hook: The handler of the events of each hook.
         roster: For each agent that is known beforehand, the handler of its decisions, its policy,
             and whether that answers.
+        alone: The points that have an agent of their own.
     """
 
     by_point: Mapping[Point, PointHandler]
     by_hook: Mapping[Hook, AnyHandler]
     roster: Mapping[str, tuple[PointHandler, Policy, bool]]
+    alone: Collection[Hook]
+
+    def with_agents(self, agents: Iterable[Agent]) -> dict[Hook, AnyHandler]:
+        """Return the handlers, with agents in place of those of their points where they can."""
+        own = {agent.point.hook: agent for agent in agents if agent.point.hook in self.alone}
+        return {**self.by_hook, **own}
 
 
 def handlers_of(plan: Plan, simulation: Model) -> Handlers:
@@ -294,4 +302,10 @@ def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
     for name, point in plan.roster.items():
         policy = plan.policy_of(name, point)
         roster[name] = by_point[point], policy, plan.is_delegated(policy)
-    return Handlers(by_point, by_hook, roster)
+    agents = [point.agent for point in plan.points]
+    alone = {
+        point.hook
+        for point in plan.points
+        if point.agent is not None and point.split is None and agents.count(point.agent) == 1
+    }
+    return Handlers(by_point, by_hook, roster, alone)

@@ -10,10 +10,13 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from ...errors import (
     BranchError,
+    NoDecisionError,
     OptionValueError,
     ReentrancyError,
     annotate,
@@ -23,7 +26,7 @@ from ...errors import (
 )
 from ...hooks.handlers import Installation
 from ...hooks.places import homes_of, is_outdated
-from ...simulation import Model, make_simulation, optional_method, passing
+from ...simulation import Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -35,6 +38,9 @@ from .base import LONGEST_TAPE, BaseSession, PendingDecision, Recording, Replay,
 from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames
+
+MOST_SEEDS: Final = 100
+"""How many seeds a reset tries until the one agent of a single view decides."""
 
 
 class Session(BaseSession):
@@ -156,8 +162,16 @@ class Session(BaseSession):
                 self._warn_of_outdated()
                 self.options = options
                 self.seed = self.seed_for(seed)
-                self._enter_ready_driver(driver)
-                return self._begin(self.seed, in_rounds, replay, beside)
+                more: list[int] | None = None
+                while True:
+                    self._enter_ready_driver(driver)
+                    try:
+                        return self._begin(self.seed, in_rounds, replay, beside)
+                    except NoDecisionError:
+                        more = self._more_seeds(self.seed) if more is None else more
+                        if not more:
+                            raise
+                        self.seed = more.pop()
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
 
@@ -174,6 +188,15 @@ class Session(BaseSession):
                 f" {listed(names)}. Calls of the new functions are no decisions here; name them in"
                 " points=, and make the environment anew"
             )
+
+    def _more_seeds(self, seed: int) -> list[int]:
+        """Return seeds that follow from one, for an agent that is not born in each episode."""
+        simulation = self._simulation
+        if self.plan.options.agent is None or not takes(simulation.reset, "seed"):
+            return []
+        if getattr(simulation, "deterministic", False):
+            return []
+        return list(map(int, np.random.SeedSequence(seed).generate_state(MOST_SEEDS - 1)))
 
     def _enter_ready_driver(self, entered: Driver) -> None:
         """Replace the driver if it cannot run another job. ``entered``: the context's driver."""
@@ -240,7 +263,7 @@ class Session(BaseSession):
         self.episode = episode = Episode(
             self, simulation, clock, self._driver, seed, replay, in_rounds=in_rounds
         )
-        return simulation.run, episode.handlers_by_hook()
+        return simulation.run, self.handlers.with_agents(episode.agents.values())
 
     def _make_clock(self) -> Clock | None:
         """Make the clock of the simulation. None if it has no time."""

@@ -1,4 +1,13 @@
-"""The state of an episode, as views and clones read it."""
+"""The state of an episode, as views and clones read it.
+
+An episode::
+
+    MOVING <--------> PENDING --------> OVER
+    the simulation    a decision waits  terminated, truncated,
+    runs, or          for the user      failed or closed
+    mappings and
+    policies do
+"""
 
 from __future__ import annotations
 
@@ -25,10 +34,11 @@ from ...simulation import RULE, Action
 from ..plans.plan import Plan
 from ..plans.policies import Where
 from ..values.actions import ILLEGAL
-from .round import Round
+from .steps import Round
 
 if TYPE_CHECKING:
     from .agent import Agent, Clock
+    from .decision import Decision
 
 
 class Outcome(Enum):
@@ -103,11 +113,13 @@ class UnmatchedNames:
     def check(self, episode: EpisodeState, called: Collection[Hook] | None) -> None:
         """Warn once of names that options and ``removed_by=`` have in vain, at an episode's end.
 
+        Where an agent has joined or ended midway, a roster is an upper bound.
+
         ``called``: the functions that end agents and were called. None if the model has not ended.
         """
         if called is not None:
             self._check_removers(episode, called)
-        if not self._names:
+        if not self._names or episode.ended or episode.has_joined:
             return
         present = [
             name
@@ -156,16 +168,20 @@ class EpisodeState:
         consulted: The agent whose policy is being asked. In a replay, the one at whose decision
             the replay ends.
         outcome: How it has ended.
+        has_joined: Whether an agent has decided for the first time when others had decided twice.
         unreported_end: Whether agents ended during the reset, which the first step reports.
         turns: The number of actions that the environment's user has given.
         round: The present round. None if the episode is played in turns.
+        earned: The team's reward of the latest step. None if each agent has its own rewards.
+        total: The team's rewards of the whole episode, at its end. None as in ``earned``.
         skips: Whether a decision with one legal action is answered with it.
         where: Where it is played, which determines the policies that are asked.
     """
 
     __slots__ = (
-        "_fault", "agents", "clock", "consulted", "ended", "just_ended", "others", "outcome",
-        "pending", "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
+        "_deciders", "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined",
+        "just_ended", "others", "outcome", "pending", "plan", "round", "seed", "skips", "total",
+        "turns", "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(
@@ -175,6 +191,7 @@ class EpisodeState:
         self.seed = seed
         self.clock = clock
         self.round = Round() if in_rounds else None
+        self.earned: float | None = None
         self.skips = plan.options.skip_forced
         self.where = where
         self.agents: dict[str, Agent] = {}
@@ -184,6 +201,9 @@ class EpisodeState:
         self.pending: Agent | None = None
         self.consulted: Agent | None = None
         self.outcome = RUNNING
+        self.total: float | None = None
+        self.has_joined = False
+        self._deciders = 0
         self.unreported_end = False
         self.turns = 0
         self._fault = ""
@@ -247,9 +267,28 @@ class EpisodeState:
         )
         return is_open and isinstance(name, str)
 
+    def find(self, name: str) -> Agent | None:
+        """Return an agent, whoever answers it. None if it has not appeared."""
+        return self.agent(name) or self.others.get(name)
+
+    def note_first_decision(self) -> None:
+        """Note that an agent decides for the first time."""
+        self.has_joined = self.has_joined or self.turns > (1 if self.in_rounds else self._deciders)
+        self._deciders += 1
+
     def move_to(self, where: Where) -> None:
         """Note that it is played in a clone or a branch from now on."""
         self.where = max(self.where, where)
+
+    def decision_of(self, agent: Agent) -> Decision:
+        """Describe the decision of an agent."""
+        return agent.describe(self.seed, self.where)
+
+    def stop(self) -> None:
+        """Note that nothing happens any more."""
+        self.pending = None
+        if self.outcome is RUNNING:
+            self.outcome = Outcome.STOPPED
 
     def step(self, action: Action) -> None:
         """Answer the pending decision: see ``Episode.step``."""

@@ -43,6 +43,8 @@ class _CommonOptions(TypedDict, total=False):
     plugins: Iterable[Any]
     global_rng: bool
     flatten: bool
+    team_reward: Callable[[Any], Any] | None
+    state_in_info: bool
     state_space: Space[Any] | Literal["observations"] | None
     render_mode: str | None
 
@@ -106,6 +108,14 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         _is_bool,
         "True or False",
     ),
+    "state_in_info": (
+        _is_bool,
+        "True or False",
+    ),
+    "team_reward": (
+        callable,
+        "a callable of the simulation or None",
+    ),
     "state_space": (
         lambda space: isinstance(space, Space) or space == "observations",
         'a gymnasium space or "observations"',
@@ -159,7 +169,13 @@ class Options:
             handler, the target and the position, as ``attach_handler`` takes them.
         global_rng: Whether the simulation gets its own state of the global generators of ``random``
             and ``numpy.random``. Each reset seeds them with the seed of the episode.
-        flatten: Whether the joint view has vectors instead of dicts.
+        flatten: Whether joint and turn views have vectors instead of dicts.
+        team_reward: One reward for all agents, in place of the ``reward_mapping`` of each: a
+            callable of the simulation that returns what the team has earned since it was last
+            called, such as ``difference(lambda simulation: simulation.profit)``. It is called when
+            a reset and each step return. Each agent gets the sum since its previous decision; the
+            joint and the turn view get it once.
+        state_in_info: Whether ``info["state"]`` is ``state()``, in joint and turn views.
         state_space: The space whose shape and dtype ``state()`` has. None: ``state()`` returns the
             value of the simulation's ``state()`` as it is. "observations": the state is the
             observations of all possible agents in one vector, and the simulation needs no
@@ -179,6 +195,8 @@ class Options:
     plugins: Iterable[Any] = ()
     global_rng: bool = False
     flatten: bool = False
+    team_reward: Callable[[Any], Any] | None = None
+    state_in_info: bool = False
     state_space: Space[Any] | str | None = None
     render_mode: str | None = None
 

@@ -31,7 +31,14 @@ from ...hooks.handlers import Handler
 from ...hooks.hook import Hook
 from ...hooks.stacks import outside_simulation
 from ...plugins import Plugins
-from ...simulation import RULE, Model, SimulationInterface, make_simulation, optional_method
+from ...simulation import (
+    EVERYONE,
+    RULE,
+    Model,
+    SimulationInterface,
+    make_simulation,
+    optional_method,
+)
 from ..switching.driver import Driver
 from ..switching.greenlets import GreenletDriver
 from ..switching.threads import ThreadDriver
@@ -197,6 +204,7 @@ class Plan:
         points: The decision points that do not run their rule.
         active: The decision points that the environment's user answers.
         policies: The policies of agents, by name.
+        everyone: The policy of all agents without one. None: there is none.
         has_planner: Whether a policy asks for the environment, and so may branch it.
         has_split: Whether a call of the model may hold several decisions.
         named_agents: The agents that ``policies`` and ``possible_agents`` name.
@@ -208,6 +216,7 @@ class Plan:
         removers: The functions whose calls end agents.
         overrides: The functions that override each of the points, and are no points.
         plugins: The handlers for this environment's simulation only. None if there are none.
+        unites: Whether a view unites the spaces of all agents.
         patches: The hooks, and the handlers with their hooks, that must be set while an environment
             is in use.
     """
@@ -217,6 +226,7 @@ class Plan:
     points: tuple[Point, ...]
     active: tuple[Point, ...]
     policies: Mapping[str, Policy]
+    everyone: Policy
     has_planner: bool
     has_split: bool
     named_agents: frozenset[str]
@@ -227,6 +237,8 @@ class Plan:
     overrides: Mapping[Point, Collection[Hook]]
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
+
+    unites: bool = False
 
     _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
 
@@ -257,7 +269,7 @@ class Plan:
         if policy is not None:
             return policy
         if not self.has_user or (self.one_agent is not None and agent != self.one_agent):
-            return RULE
+            return self.everyone or RULE
         if not self.complete or agent in self.roster:
             return None
         if self.options.undeclared == "rule":
@@ -267,6 +279,10 @@ class Plan:
             " possible_agents; declare it, or let its rule decide with"
             ' undeclared="rule"'
         )
+
+    def can_share(self, one: Point, other: Point) -> bool:
+        """Return whether an agent may decide at both of two points."""
+        return self.unites or not self.has_user or one.has_spaces_of(other)
 
     def is_delegated(self, policy: Policy) -> bool:
         """Return whether agents with a policy are no agents of the environment."""
@@ -381,7 +397,9 @@ def make_plan(
         points = getattr(inspected, "points", None)
     if points is None and not has_user and default_policy is None:
         policies = checked.policies or {}
-        names_agents = any(isinstance(key, str) and "." not in key for key in policies)
+        names_agents = any(
+            key is EVERYONE or (isinstance(key, str) and "." not in key) for key in policies
+        )
         if not names_agents:
             points = ()  # the points in ``policies`` are enough
     own = own_points(inspected)
@@ -404,6 +422,11 @@ def make_plan(
     return _resolve(subject, checked)
 
 
+def _no_reward() -> float:
+    """Reward nothing, because the team's reward takes the place of the agent's."""
+    return 0.0
+
+
 # -- who decides where ----------------------------------------------------------------------------
 
 
@@ -418,17 +441,26 @@ def _resolve(subject: Subject, options: Options) -> Plan:
     only = options.agent if options.agent in known else None
     has_user = subject.mode is Mode.ENVIRONMENT
     collects = subject.mode is Mode.COLLECT
+    everyone = (options.policies or {}).get(EVERYONE)
+    if has_user and everyone is not None and options.agent is None:
+        raise OptionValueError(
+            "a policy for all agents leaves no decision to the environment; name the agent that its"
+            " user answers with agent="
+        )
+    default = subject.default_policy if has_user or everyone is None else everyone
     points: list[Point] = []
     active: list[Point] = []
     for hook, definition in definitions.items():
         agent = agents[hook]
-        policy = by_point.get(hook, subject.default_policy)
+        policy = by_point.get(hook, default)
         if options.agent is not None and agent != only:
-            policy = policy or RULE
+            policy = policy or everyone or RULE
         policies = [policy, *by_agent.values()] if agent is None else [by_agent.get(agent, policy)]
         if policy is RULE and policies == [RULE]:
             continue
         clips = options.clip_actions
+        if options.team_reward is not None:
+            definition = replace(definition, reward_mapping=_no_reward)
         point = Point(hook, definition, agent, policy, records=collects, clips=clips)
         points.append(point)
         is_active = policies[0] is None
@@ -464,13 +496,14 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         points=tuple(points),
         active=tuple(active),
         policies=by_agent,
+        everyone=everyone,
         has_planner=any(
             isinstance(policy, AskingPolicy) and policy.plans
             for policy in (*by_point.values(), *by_agent.values())
         ),
         has_split=any(point.split is not None for point in points),
         named_agents=frozenset({*by_agent, *options.declared_agents} - ruled),
-        one_agent=active[0].agent or options.agent if len(active) == 1 else None,
+        one_agent=_one_agent(active, options),
         roster=roster,
         complete=complete,
         removers=removers,
@@ -481,6 +514,14 @@ def _resolve(subject: Subject, options: Options) -> Plan:
             *((handler.target, handler) for handler in handlers),
         ),
     )
+
+
+def _one_agent(active: Collection[Point], options: Options) -> str | None:
+    """Return the only agent that the user answers. None if there may be several."""
+    names = {point.agent for point in active}
+    if len(names) > 1 or (len(active) > 1 and None in names):
+        return None
+    return next(iter(names), None) or options.agent
 
 
 def _checked_render_mode(subject: Subject, options: Options) -> Options:
@@ -516,8 +557,10 @@ def _choose_one(
             f"agent={short_repr(agent)} names no agent of the environment; its agents are"
             f" {', '.join(names)}{did_you_mean(agent, names)}"
         )
-    points = [roster[agent]] if complete else active
-    if len(points) > 1:
+    points = active
+    if complete:
+        points = [point for point in active if point.agent == agent] or [roster[agent]]
+    elif len(points) > 1:
         raise AgentError(
             f"the agent {short_repr(agent)} may decide at"
             f" {', '.join(point.hook.name for point in points)}; name its decision point in"

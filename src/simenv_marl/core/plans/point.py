@@ -206,6 +206,16 @@ class Point:
         removers = {**self.hook.removed_by, **definition.removed_by}
         self.removed_by = {name: _bound(part, simulation) for name, part in removers.items()}
 
+    def has_spaces_of(self, other: Point) -> bool:
+        """Return whether another point has the same spaces."""
+        mine = self.definition
+        its = other.definition
+        pairs = (
+            (mine.observation_space, its.observation_space),
+            (mine.action_space, its.action_space),
+        )
+        return all(one is two or one == two for one, two in pairs)
+
     def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
         """Make a function callable with all arguments of a call, as ``adapt`` does."""
         if self.definition.split is not None and name not in _WITHOUT_ITEM:

@@ -40,7 +40,7 @@ from ...hooks.places import (
     raw_attribute,
     resolve,
 )
-from ...simulation import RULE, Model
+from ...simulation import EVERYONE, RULE, Model
 from .point import Point, Policy
 from .policies import two_arguments
 
@@ -209,17 +209,14 @@ def _named(key: object, points: Iterable[DecisionPoint]) -> DecisionPoint | None
 
 def agent_names(definitions: Definitions) -> dict[DecisionPoint, str | None]:
     """Name the agent of each point. None if a callable names it."""
-    owners: dict[str, DecisionPoint] = {}
-    for point, definition in definitions.items():
-        agent = definition.agent
-        if isinstance(agent, str) and owners.setdefault(agent, point) is not point:
-            raise AgentError(f"{owners[agent].name} and {point.name} have the same agent {agent!r}")
+    taken = {definition.agent for definition in definitions.values()}
     names: dict[DecisionPoint, str | None] = {}
     for point, definition in definitions.items():
         agent = definition.agent
         if agent is None:
             defaults = (f"{point.letters}_{number}" for number in count())
-            agent = next(name for name in defaults if owners.setdefault(name, point) is point)
+            agent = next(name for name in defaults if name not in taken)
+            taken.add(agent)
         names[point] = agent if isinstance(agent, str) else None
     return names
 
@@ -253,11 +250,11 @@ def resolve_roster(
     roster: dict[str, Point] = {}
     for point in active:
         for name in names.get(point.hook, ()) if point.agent is None else [point.agent]:
-            if not isinstance(name, str) or name in roster:
+            if not isinstance(name, str) or roster.get(name) is point:
                 raise AgentError(
                     f"possible_agents must be different strings, not {short_repr(name)}"
                 )
-            roster[name] = point
+            roster.setdefault(name, point)
     return roster, not naming or declared is not None
 
 
@@ -273,6 +270,8 @@ def resolve_policies(
     definitions = dict(named)
     agents = agent_names(named).values()
     for key, value in policies.items():
+        if key is EVERYONE:
+            continue
         policy = value if value is RULE else two_arguments(value)
         if isinstance(key, str) and key in agents:
             by_agent[key] = policy

@@ -1,15 +1,16 @@
 """Policies: who answers a decision, and the arguments of a policy.
 
 A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it
-decides. A policy with ``_decision`` gets the pending ``Decision``. A coroutine function is awaited.
-All other policies get an observation, or an observation and an info.
+decides. A policy with ``_decision`` gets the pending ``Decision``, one with ``_state`` the state of
+the simulation. A coroutine function is awaited. All other policies get an observation, or an
+observation and an info.
 """
 
 from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
@@ -56,6 +57,9 @@ class AskedEpisode(Protocol):
     def planner_view(self) -> object:
         """Return the environment for a policy that asks for it."""
 
+    def read_state(self) -> object:
+        """Return the state of the simulation for a policy that asks for it."""
+
 
 class AskedAgent(Protocol):
     """An agent, as policies use it."""
@@ -68,8 +72,8 @@ class AskedAgent(Protocol):
         """Return the decision of the agent, for a policy that asks for it."""
 
 
-ASKED: Final = ("_environment", "_decision")
-"""The keyword-only parameters of policies that ask for more."""
+ASKED: Final = ("_environment", "_decision", "_state")
+"""The keyword-only parameters of policies that ask for more. Batches have the last alone."""
 
 
 def takes_info(policy: Callable[..., Action]) -> bool:
@@ -102,14 +106,20 @@ def records(policy: Policy) -> bool:
 
 def is_asked_alone(policy: Policy) -> bool:
     """Return whether a policy answers one decision at a time: see this module."""
-    return waits(policy) or any(asks_for(policy, name) for name in ASKED)
+    return waits(policy) or any(asks_for(policy, name) for name in ASKED[:-1])
+
+
+def takes_state(policy: Policy) -> bool:
+    """Return whether a policy asks for ``_state``. An attribute ``takes_state`` may say so."""
+    told = getattr(policy, "takes_state", None)
+    return told if isinstance(told, bool) else asks_for(policy, ASKED[-1])
 
 
 def two_arguments(policy: Callable[..., Action]) -> Callable[[Observation, Info], Action]:
     """Make a policy callable with observation and info."""
-    if isinstance(policy, AskingPolicy):
+    if isinstance(policy, EpisodePolicy):
         return policy
-    if is_asked_alone(policy):
+    if is_asked_alone(policy) or takes_state(policy):
         return AskingPolicy(policy)
     return policy if takes_info(policy) else lambda observation, info: policy(observation)
 
@@ -223,10 +233,16 @@ class EpisodePolicy(ABC):
 
     Attributes:
         waits: Whether it must be awaited.
+        batched: Whether it answers many decisions in one call, where many wait.
+        looks_back: Whether it needs the arguments of decisions that were answered before.
+        takes_state: Whether it needs the state of the simulation.
         policy: The user's policy, for errors.
     """
 
     waits = False
+    batched = False
+    looks_back = False
+    takes_state = False
     policy: Policy
 
     @abstractmethod
@@ -234,6 +250,21 @@ class EpisodePolicy(ABC):
         self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
     ) -> Action:
         """Answer one decision at once."""
+
+    def respond(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Answer one decision, perhaps with a tuple of the action and a dict of extras."""
+        return self.answer(episode, agent, observation, info)
+
+    def respond_to_many(
+        self, agents: Sequence[Any], infos: Sequence[Info], states: object
+    ) -> Action:
+        """Answer the decisions of some agents, as a policy of ``simulate_many`` does.
+
+        ``states``: the stacked states, if it takes them.
+        """
+        raise NotImplementedError
 
     def __call__(self, observation: Observation, info: Info) -> Action:
         """Refuse a call without an episode."""
@@ -254,6 +285,8 @@ class AskingPolicy(EpisodePolicy):
         plans: Whether it gets the environment.
         asks: Whether it gets the decision.
     """
+
+    looks_back = True
 
     def __init__(self, policy: Callable[..., Action]) -> None:
         self.policy = policy
@@ -287,4 +320,6 @@ class AskingPolicy(EpisodePolicy):
             asked[ASKED[0]] = episode.planner_view()
         if ASKED[1] in call.names:
             asked[ASKED[1]] = agent.describe(episode.seed, episode.where)
+        if ASKED[2] in call.names:
+            asked[ASKED[2]] = episode.read_state()
         return call(observation, info, asked)

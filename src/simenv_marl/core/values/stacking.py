@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.spaces import Dict, Discrete, Tuple
 
+from ...errors import ObservationError
 from ...simulation import Action, Observation
 from .spaces import Array, ArraySpace, Space, parts_of
 
@@ -80,9 +81,9 @@ def stacker(space: Space, *, cast: bool = False) -> Stacker:
     return stack
 
 
-def stack_masks(masks: Sequence[Any]) -> Any:
-    """Stack masks of one action space."""
-    return _map(np.stack, masks)
+def stacked(items: Sequence[Any]) -> Any:
+    """Stack masks of one action space, or states."""
+    return _map(np.stack, items)
 
 
 def taken(stack: Any, index: Array | int) -> Any:
@@ -104,7 +105,13 @@ def _map(function: Callable[[Sequence[Array]], Any], stacks: Sequence[Any]) -> A
             return {key: _map(function, [stack[key] for stack in stacks]) for key in first}
         case tuple():
             return tuple(_map(function, parts) for parts in zip(*stacks, strict=True))
-    return function(stacks)
+    try:
+        return function(stacks)
+    except ValueError as error:
+        raise ObservationError(
+            f"rows of arrays differ ({error}): state(), and each extra of a policy, must always"
+            " have the same shape"
+        ) from error
 
 
 def split_batch(stack: Action, *, integers: bool) -> list[Action] | None:

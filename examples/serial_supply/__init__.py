@@ -1,0 +1,1 @@
+"""An unmodified supply chain of stockpyl with a known optimum, and cooperative learners for it."""

@@ -1,0 +1,197 @@
+"""What the agents of a step share: the round that is played, and the team's reward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from ...errors import short_repr, warn_user
+from ...hooks.stacks import outside_simulation
+from ...plugins import Plugins
+from ...simulation import RULE, Action, Model
+from ..switching.driver import WAIT
+from ..values.actions import mask_allows
+from ..values.rewards import checked_reward
+
+if TYPE_CHECKING:
+    from .agent import Agent
+
+MANY_ROUNDS: Final = 100
+"""After so many rounds in a row without an action for the pending agent, the user is warned."""
+
+
+class Round:
+    """The present round of an episode. It uses each action once, up to a decision without one.
+
+    Attributes:
+        actions: The actions that no decision has used yet, by agent.
+        acted: The names of the agents whose action was used in this round.
+        used: The number of actions in the episode, other than ``RULE``, that decisions have used.
+        unused: The number of actions that no decision has used.
+        early: The number of used actions that were chosen before their decision arose.
+        stalled: The number of rounds in a row without an action for the pending agent.
+    """
+
+    __slots__ = ("_pending", "acted", "actions", "early", "stalled", "unused", "used")
+
+    def __init__(self) -> None:
+        self.actions: dict[str, Action] = {}
+        self.acted: set[str] = set()
+        self.used = 0
+        self.unused = 0
+        self.early = 0
+        self.stalled = 0
+        self._pending = ""  # the agent whose decision waited when the round began
+
+    @property
+    def given(self) -> int:
+        """The number of actions in the episode, other than ``RULE``."""
+        return self.used + self.unused
+
+    def begin(self, actions: dict[str, Action], pending: str) -> None:
+        """Begin a round with checked actions. ``pending``: the agent whose decision waits."""
+        self.actions = actions
+        self._pending = pending
+        self.acted = set()
+
+    def take(self, agent: Agent) -> Action:
+        """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal now."""
+        action = self.actions.pop(agent.name, WAIT)
+        if action is WAIT:
+            return WAIT
+        if action is not RULE:
+            if agent.mask is not None:
+                space = agent.point.definition.action_space
+                if not mask_allows(space, agent.mask, action):
+                    return WAIT
+            self.used += 1
+            self.early += agent.name != self._pending
+        self.acted.add(agent.name)
+        return action
+
+    def count_unused(self) -> None:
+        """Count the actions that the round has not used."""
+        for action in self.actions.values():
+            self.unused += action is not RULE
+
+    def explain_losses(self) -> str:
+        """Explain how many actions were lost. Empty if at least nine in ten were used."""
+        if 10 * self.used >= 9 * self.given:
+            return ""
+        return (
+            f"of {self.given} actions in this episode, {self.used} were used: the agents do not"
+            " decide in each round, and the other actions are lost;"
+            f" {self.early} decisions were answered by an action that was chosen before they"
+            " arose. aec_env loses none, nor does turn_env, for one learner"
+        )
+
+    def note_moved(self) -> None:
+        """Note that the simulation has moved."""
+        self.stalled = 0
+
+    def note_stalled(self, pending: Agent) -> None:
+        """Note that the simulation has not moved. Warn if that is so for many rounds."""
+        self.stalled += 1
+        if self.stalled == MANY_ROUNDS:
+            warn_user(
+                f"the simulation stands still: {short_repr(pending.name)} must decide, but"
+                f" {MANY_ROUNDS} rounds in a row had no action for it; the info of the agent that"
+                ' must decide has "deciding": True'
+            )
+
+
+class NotedEpisode(Protocol):
+    """An episode whose states are noted."""
+
+    turns: int
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch that a policy has made of its environment."""
+
+    def read_state(self) -> Model:
+        """Return the state of the simulation."""
+
+    def annotate(self, error: BaseException) -> None:
+        """Add a note to an error: the decision and the agent where it arose."""
+
+
+class Team:
+    """The team of an episode.
+
+    Attributes:
+        earned: What the team has earned in the latest step. 0.0 at the reset.
+        total: What it has earned since the first decision.
+        plugins: The handlers that take part in its callable.
+        memory: The values of differences in its callable.
+    """
+
+    __slots__ = ("_earn", "_ended", "_has_begun", "_paid", "earned", "memory", "plugins", "total")
+
+    def __init__(self, earn: Callable[[], Model], plugins: Plugins | None) -> None:
+        """Begin without any reward. ``earn`` returns what was earned since it was last called."""
+        self._earn = earn
+        self._ended: list[Agent] = []  # in this step
+        self._has_begun = False
+        self._paid: dict[str, float] = {}  # the total at each agent's latest reward
+        self.earned = 0.0
+        self.total = 0.0
+        self.plugins = plugins
+        self.memory: dict[Any, Any] = {}
+
+    def join(self, agent: Agent) -> None:
+        """Pay an agent for all of this step, because it acts before it was ever paid."""
+        self._paid.setdefault(agent.name, self.total)
+
+    def note_end(self, agent: Agent) -> None:
+        """Note an agent that has ended. It is paid for all of this step."""
+        self._ended.append(agent)
+
+    def settle(self, agents: Collection[Agent]) -> float:
+        """Ask what was earned in this step, and pay agents that have decided, and ended ones.
+
+        The first call is at the reset, before any action, so its value is dropped. Return what was
+        earned.
+        """
+        with outside_simulation(self):
+            earned = checked_reward("the team", self._earn())
+        if self._has_begun:
+            self.earned = earned
+            self.total += earned
+        self._has_begun = True
+        for agent in (*self._ended, *agents):
+            if agent.decided:
+                agent.pay(self.total - self._paid.get(agent.name, self.total))
+                self._paid[agent.name] = self.total
+        self._ended = []
+        return self.earned
+
+
+class StateNotes:
+    """The states of an episode that learners ask for. Each is read once.
+
+    Attributes:
+        ends: The state at the end of each agent that has ended midway, until it is taken.
+    """
+
+    def __init__(self, episode: NotedEpisode) -> None:
+        self._episode = episode
+        self._latest: tuple[int, Model] | None = None  # the turn, and the state
+        self.ends: dict[Agent, Model] = {}
+
+    def read(self) -> Model:
+        """Return the state at the pending decision, or at the end."""
+        episode = self._episode
+        if episode.is_branch:  # policies answer here, and ``turns`` stays
+            return episode.read_state()
+        if self._latest is None or self._latest[0] != episode.turns:
+            try:
+                self._latest = episode.turns, episode.read_state()
+            except BaseException as error:
+                episode.annotate(error)
+                raise
+        return self._latest[1]
+
+    def note_end(self, agent: Agent) -> None:
+        """Note the state at the end of an agent."""
+        self.ends[agent] = self._episode.read_state()

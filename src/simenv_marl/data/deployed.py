@@ -1,0 +1,215 @@
+"""Policies for all agents, made of a learner that was trained in a turn or a joint view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ..core import (
+    MASK,
+    Action,
+    Agent,
+    Caller,
+    Episode,
+    EpisodePolicy,
+    Info,
+    Observation,
+    Plan,
+    is_asked_alone,
+    split_batch,
+    stacker,
+    takes_state,
+)
+from ..envs import SimulationJointEnv, SimulationTurnEnv
+from ..envs.base import OneAgentView
+from ..envs.joint import Joint
+from ..envs.turn import Turn
+from ..errors import InvalidActionError, OptionValueError, UnknownAgentError, short_repr
+from ..simulation import EVERYONE, RULE
+
+Predict = Callable[..., Any]
+"""Takes an observation, or an observation and an info. Returns an action, or that and extras."""
+
+UNUSED = object()
+"""The action of an agent that has none left in its round."""
+
+
+def turn_policy(predict: Predict, *, like: Any, batched: bool = False) -> dict[Any, Any]:
+    """Make policies for all agents of a learner that was trained in a turn view.
+
+    Args:
+        predict: A callable of the observation, or of the observation and the info: the agent's name
+            as ``info["agent"]``, the mask as ``info["action_mask"]``, the time. It returns the
+            action, or a tuple of the action and extras (``model.predict`` of Stable-Baselines3).
+        like: The environment in which it was trained, or one with the same arguments.
+        batched: Whether ``simulate_many``, ``collect_episodes`` and ``evaluate(batched=True)`` ask
+            for many decisions at once, with stacks of observations and masks. ``info["agent"]`` is
+            a list of names then.
+
+    Returns:
+        Policies for ``simulate``, ``evaluate``, ``run_experiment`` and ``policies=``. In an
+        environment, ``agent=`` names the agent that the user answers.
+
+    Raises:
+        OptionValueError: ``like`` is no environment of a turn view.
+    """
+    return {EVERYONE: TurnPolicy(predict, _plan_of(like, SimulationTurnEnv), batched)}
+
+
+def joint_policy(predict: Predict, *, like: Any) -> dict[Any, Any]:
+    """Make policies for all agents of a learner that was trained in a joint view.
+
+    Decisions are answered in rounds, as in the joint view: with the actions of the latest answer,
+    until an agent has used its own. Then all agents are observed, and ``predict`` answers again.
+
+    Args:
+        predict: A callable of the joint observation, or of the observation and the info:
+            ``"deciding"``, ``"acted"`` and ``"action_mask"``. It returns the joint action, or a
+            tuple of the action and extras.
+        like: The environment in which it was trained, or one with the same arguments.
+
+    Returns:
+        Policies, as ``turn_policy`` returns them.
+
+    Raises:
+        OptionValueError: ``like`` is no environment of a joint view.
+    """
+    return {EVERYONE: JointPolicy(predict, _plan_of(like, SimulationJointEnv))}
+
+
+def _plan_of(like: Any, kind: type[OneAgentView]) -> Plan:
+    """Return the plan of an environment. It may have wrappers, or be a vector environment."""
+    view = getattr(like, "unwrapped", like)
+    envs = getattr(view, "envs", None)
+    if envs:
+        view = envs[0].unwrapped
+    if not isinstance(view, kind):
+        raise OptionValueError(
+            f"like= must be an environment of the view in which the policy was trained"
+            f" ({kind.__name__}), not {short_repr(like)}"
+        )
+    return view.session.plan
+
+
+class _Deployed(EpisodePolicy):
+    """A learner's policy for all agents."""
+
+    def __init__(self, predict: Predict, plan: Plan) -> None:
+        if is_asked_alone(predict):
+            raise OptionValueError(
+                f"{short_repr(predict)} must answer at once, and can ask for _state alone, not for"
+                " _environment or _decision"
+            )
+        self.policy = predict
+        self.takes_state = takes_state(predict)
+        self._call = Caller(predict)
+        self._plan = plan
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.policy, self._plan)
+
+    def _ask(
+        self, observation: Observation, info: Info, space: Any, state: object
+    ) -> tuple[Action, Any]:
+        """Ask for an action in a space; return it, and the extras."""
+        answer = self._call(observation, info, {"_state": state})
+        has_extras = isinstance(answer, tuple) and not isinstance(space, spaces.Tuple)
+        action, extras = answer if has_extras else (answer, {})
+        return action, extras if isinstance(extras, Mapping) else {}
+
+    def answer(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Action:
+        """Answer one decision at once."""
+        action, _ = self.respond(episode, agent, observation, info)
+        return action
+
+
+class TurnPolicy(_Deployed):
+    """A policy for all agents of a learner of the turn view: see ``turn_policy``."""
+
+    def __init__(self, predict: Predict, plan: Plan, batched: bool = False) -> None:
+        super().__init__(predict, plan)
+        self.batched = batched
+        self._turn: Turn = plan.derive(Turn)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TurnPolicy, (self.policy, self._plan, self.batched)
+
+    def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
+        """Answer one decision with the action and the extras."""
+        seen = self._turn.observe(agent)
+        state = episode.read_state() if self.takes_state else None
+        told = self._info(agent, info)
+        action, extras = self._ask(seen, told, self._turn.action_space, state)
+        return self._own(agent, action), extras
+
+    def respond_to_many(
+        self, agents: Sequence[Agent], infos: Sequence[Info], states: object
+    ) -> Action:
+        """Answer many decisions at once with the actions and the extras."""
+        stack = stacker(self._turn.observation_space, cast=True)
+        seen = stack([self._turn.observe(agent) for agent in agents])
+        told: Info = {"agent": [agent.name for agent in agents]}
+        if self._turn.has_masks:
+            masks: list[Any] = [self._turn.mask(agent) for agent in agents]
+            told[MASK] = np.stack(masks)
+        answers, extras = self._ask(seen, told, self._turn.action_space, states)
+        actions = split_batch(answers, integers=True)
+        if actions is None or len(actions) != len(agents):
+            raise InvalidActionError(
+                f"{short_repr(self.policy)} was asked for {len(agents)} decisions at once, and"
+                f" returned {short_repr(answers)}"
+            )
+        return list(map(self._own, agents, actions)), extras
+
+    def _info(self, agent: Agent, info: Info) -> Info:
+        """Return the info of a decision. Times since the last step are not known here."""
+        told: Info = {"agent": agent.name}
+        if self._turn.has_masks:
+            told[MASK] = self._turn.mask(agent)
+        if "time" in info:
+            told["time"] = info["time"]
+        return told
+
+    def _own(self, agent: Agent, action: Action) -> Action:
+        return action if action is RULE else self._turn.decode(agent, action)
+
+
+class JointPolicy(_Deployed):
+    """A policy for all agents of a learner of the joint view: see ``joint_policy``."""
+
+    looks_back = True
+
+    def __init__(self, predict: Predict, plan: Plan) -> None:
+        super().__init__(predict, plan)
+        self._joint: Joint = plan.derive(Joint)
+
+    def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
+        """Answer one decision with the agent's action of the round. Begin another without one."""
+        if agent.name not in self._joint.roster:
+            raise UnknownAgentError(
+                f"{agent.name!r} is no agent of the joint view in which the policy was trained"
+            )
+        unused = episode.memory.get(self, {})
+        action = unused.pop(agent.name, UNUSED)
+        if action is UNUSED or not (action is RULE or agent.allows(action)):
+            unused = self._begin_round(episode, agent)
+            action = unused.pop(agent.name)
+        return action, {}
+
+    def _begin_round(self, episode: Episode, deciding: Agent) -> dict[str, Action]:
+        """Ask for the actions of all live agents, and return them."""
+        episode.observe_others(deciding)
+        found = {name: episode.find(name) for name in self._joint.roster}
+        seen, told = self._joint.see(list(found.values()))
+        unused = episode.memory.get(self, found)
+        told["deciding"] = deciding.name
+        told["acted"] = {name: name not in unused for name in found}
+        state = episode.read_state() if self.takes_state else None
+        answer, _ = self._ask(seen, told, self._joint.action_space, state)
+        live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
+        actions = self._joint.actions(live, answer)
+        episode.memory[self] = actions
+        return actions

@@ -1,0 +1,212 @@
+"""One reward for the team, in all views."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+
+from simenv_marl import (
+    RULE,
+    aec_env,
+    clone,
+    difference,
+    generate_env,
+    joint_env,
+    parallel_env,
+    single_env,
+    turn_env,
+)
+from simenv_marl.errors import OptionValueError, RewardError
+from tests.worlds import random_worlds as yards
+from tests.worlds.models import calling, decision, play, script
+
+CLOSE = {"rel": 1e-9, "abs": 1e-6}
+
+
+class Counter:
+    """A team's reward: the number of times that it was asked, and its values."""
+
+    def __init__(self, *values: float) -> None:
+        self.values = list(values)
+        self.asked = 0
+
+    def __call__(self, simulation: Any) -> float:
+        self.asked += 1
+        return self.values[self.asked - 1] if self.values else 1.0
+
+
+def agents(number=2):
+    """Decision functions of agents, whose own rewards must not count."""
+    return [
+        decision(agent=f"{name}_0", reward_mapping=lambda: 1 / 0)
+        for name in ("ant", "bee", "cat")[:number]
+    ]
+
+
+# -- who gets what --------------------------------------------------------------------------------
+
+
+def test_an_agent_gets_what_the_team_has_earned_since_its_previous_decision():
+    ant, bee = agents()
+    team = Counter(100, 1, 2, 4, 8)
+    env = aec_env(calling(ant, bee, bee, ant), [ant, bee], team_reward=team)
+    turns = play(env, 1)
+    rewards = [(turn.agent, turn.reward) for turn in turns]
+    assert rewards == [
+        ("ant_0", 0.0),
+        ("bee_0", 0.0),
+        ("bee_0", 2.0),
+        ("ant_0", 7.0),
+        ("ant_0", 8.0),
+        ("bee_0", 12.0),
+    ]
+    assert team.asked == 5  # not at the None steps
+
+
+def test_one_learner_gets_each_earning_once():
+    for make in (turn_env, single_env):
+        ant, bee = agents()
+        policies = {"bee_0": lambda observation: 1} if make is single_env else None
+        env = make(
+            calling(ant, bee, ant),
+            [ant, bee],
+            team_reward=Counter(100, 1, 2, 4),
+            policies=policies,
+        )
+        env.reset()
+        rewards = [env.step(1)[1] for _ in range(3 if make is turn_env else 2)]
+        assert rewards == ([1.0, 2.0, 4.0] if make is turn_env else [1.0, 2.0])
+
+
+def test_rounds_pay_each_live_agent_what_the_round_has_earned():
+    ant, bee = agents()
+    env = parallel_env(calling(ant, bee, ant, bee), [ant, bee], team_reward=Counter(100, 1, 2))
+    env.reset()
+    assert env.step({"ant_0": 1, "bee_0": 1})[1] == {"ant_0": 1.0, "bee_0": 1.0}
+    assert env.step({"ant_0": 1, "bee_0": 1})[1] == {"ant_0": 2.0, "bee_0": 2.0}
+    env = joint_env(calling(ant, bee, ant, bee), [ant, bee], team_reward=Counter(100, 1, 2))
+    env.reset()
+    assert [env.step({"ant_0": 1, "bee_0": 1})[1] for _ in range(2)] == [1.0, 2.0]
+
+
+def test_a_reward_that_is_no_number_is_refused():
+    ant, _ = agents()
+    env = aec_env(calling(ant), [ant], team_reward=lambda simulation: None)
+    with pytest.raises(RewardError, match="is not one number"):
+        env.reset()
+    with pytest.raises(OptionValueError, match="a callable of the simulation"):
+        aec_env(calling(ant), [ant], team_reward=1.0)
+
+
+# -- what adds up to what -------------------------------------------------------------------------
+
+
+def earned(yard: yards.Yard) -> float:
+    """What a yard has earned in all, with births and deaths."""
+    return yard.fortune + 10.0 * yard.built
+
+
+@given(yards.designs, yards.seeds)
+@settings(max_examples=60)
+def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
+    options: dict[str, Any] = {
+        "possible_agents": yards.ROSTER,
+        "team_reward": difference(earned),
+    }
+    for view in ("turn", "joint"):
+        env = generate_env(lambda: yards.Yard(design), yards.POINTS, view=view, **options)()
+        env.reset(seed=seed)
+        before = earned(env.simulation)
+        total, ended = 0.0, False
+        while not ended:
+            _, reward, terminated, truncated, _ = env.step(RULE)
+            total += reward
+            ended = terminated or truncated
+        assert total == pytest.approx(earned(env.simulation) - before, **CLOSE)
+        env.close()
+    aec = aec_env(lambda: yards.Yard(design), yards.POINTS, **options)
+    begins: dict[str, float] = {}
+    totals: dict[str, float] = {}
+    ends: dict[str, float] = {}
+    aec.reset(seed=seed)
+    while aec.agents:
+        agent = aec.agent_selection
+        _, reward, terminated, truncated, _ = aec.last()
+        ended = terminated or truncated
+        now = earned(aec.simulation)
+        if not ended:
+            begins.setdefault(agent, now)
+        totals[agent] = totals.get(agent, 0.0) + reward
+        if ended:
+            ends[agent] = now  # at the return of the step in which it ended
+        aec.step(None if ended else RULE)
+    for agent, begin in begins.items():
+        assert totals[agent] == pytest.approx(ends[agent] - begin, **CLOSE)
+    assert all(totals[agent] == 0.0 for agent in totals.keys() - begins.keys())
+    aec.close()
+
+
+@given(yards.designs, yards.seeds)
+@settings(max_examples=30)
+def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, seed):
+    env = parallel_env(
+        lambda: yards.Yard(design),
+        yards.POINTS,
+        possible_agents=yards.ROSTER,
+        team_reward=difference(earned),
+    )
+    env.reset(seed=seed)
+    episode = env.session.episode
+    now = earned(env.simulation)
+    # The total when the round of each agent's first decision began.
+    joined = {episode.pending.name: now}
+    totals: dict[str, float] = {}
+    while env.agents:
+        before = now
+        _, rewards, terminations, truncations, infos = env.step(RULE)
+        now = earned(env.simulation)
+        for agent, reward in rewards.items():
+            if episode.agent(agent).decided:
+                joined.setdefault(agent, before if infos[agent]["acted"] else now)
+            totals[agent] = totals.get(agent, 0.0) + reward
+            if terminations[agent] or truncations[agent]:
+                due = now - joined.get(agent, now)
+                assert totals[agent] == pytest.approx(due, **CLOSE)
+    env.close()
+
+
+def test_clones_go_on_with_the_teams_reward():
+    ant, bee = agents()
+
+    def main(simulation):
+        simulation.level = 0
+        for step in range(4):
+            simulation.level += step + ant()
+            simulation.level += bee()
+
+    team = difference(lambda simulation: simulation.level)
+    for make in (turn_env, aec_env, joint_env):
+        env = make(script(main), [ant, bee], team_reward=team)
+        env.reset(seed=1)
+        env.step({"ant_0": 2, "bee_0": 1} if make is joint_env else 2)
+        twins = [clone(env), clone(env, method="replay")]
+        rewards = rest(env)
+        assert sum(rewards) > 0
+        for twin in twins:
+            assert rest(twin) == pytest.approx(rewards)
+            twin.close()
+        env.close()
+
+
+def rest(env: Any) -> list[float]:
+    """The rewards of the rest of an episode that follows the rule with 3."""
+    rewards = []
+    if hasattr(env, "agents"):
+        return [turn.reward for turn in play(env, 3, reset=False)]
+    ended = False
+    while not ended:
+        is_joint = hasattr(env, "joint")
+        _, reward, terminated, truncated, _ = env.step({"ant_0": 3, "bee_0": 3} if is_joint else 3)
+        rewards.append(reward)
+        ended = terminated or truncated
+    return rewards

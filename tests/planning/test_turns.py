@@ -1,0 +1,191 @@
+"""In the turn view, planners try the learner's actions; the return is the sum over all agents."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TransformAction, TransformReward
+
+from simenv_marl import RULE, branch, clone, turn_env
+from simenv_marl.errors import InvalidActionError, OptionValueError, UnknownAgentError
+from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
+from tests.planning.test_action_values import METHODS, begun, futures_of
+from tests.worlds import random_worlds as yards
+from tests.worlds.duels import Duel, Unseeded, points
+from tests.worlds.models import calling, decision
+
+ONE_FUTURE = pytest.mark.filterwarnings("ignore:.*cannot draw new random numbers")
+
+
+def made(model=Duel, **options):
+    """A duel whose pending decision is that of the one on the left."""
+    return begun(turn_env(model, points(), **options))
+
+
+def by_hand(env, action, seed, *, base, horizon=None, discount=1.0, terminal=0.0):
+    """What an action is worth in a future, by stepping a clone."""
+    twin = clone(env, seed=seed, method="replay")
+    total, weight, steps, ended = 0.0, 1.0, 0, False
+    while not ended and steps != horizon:
+        seen, reward, terminated, truncated, info = twin.step(action)
+        total += weight * reward
+        steps, weight, ended = steps + 1, weight * discount, terminated or truncated
+        action = RULE if ended or base is RULE else base(seen, info)
+    twin.close()
+    return total + (0.0 if ended else weight * terminal)
+
+
+def rising(seen, info):
+    return (int(seen["observation"][0]) + seen["kind"] + len(info["agent"])) % 3
+
+
+@METHODS
+@pytest.mark.parametrize("base", [RULE, rising])
+@pytest.mark.parametrize(
+    "given", [{}, {"horizon": 1}, {"horizon": 4, "discount": 0.5}, {"discount": 0.9}]
+)
+def test_values_are_those_of_clones_that_are_stepped_by_hand(base, given, method):
+    env = made()
+    for _ in range(3):  # up to a decision of the one on the right
+        env.step(2)
+    told = action_values(
+        env, futures=2, base=base, method=method, terminal_value=lambda env: 7.0, **given
+    )
+    table = [
+        [
+            by_hand(env, action, seed, base=base, terminal=7.0, **given)
+            for seed in futures_of(env, 2)
+        ]
+        for action in range(3)
+    ]
+    assert told.actions == (0, 1, 2)
+    assert told.returns == pytest.approx(np.array(table))
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+def test_values_among_births_and_deaths_are_those_by_hand(flatten):
+    class Yard(yards.Yard):
+        def reseed(self, seed):
+            self.random.seed(seed)
+
+    design = yards.Design(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
+    options = {"possible_agents": yards.ROSTER, "flatten": flatten}
+    env = begun(turn_env(lambda: Yard(design), yards.POINTS, **options))
+    actions = [RULE, *range(env.action_space.n)]
+    for _ in range(3):
+        told = action_values(env, actions, futures=2)
+        table = [
+            [by_hand(env, action, seed, base=RULE) for seed in futures_of(env, 2)]
+            for action in actions
+        ]
+        assert told.returns == pytest.approx(np.array(table))
+        env.step(told.best)
+
+
+@METHODS
+def test_a_base_by_agent_sees_and_acts_as_the_agents_do(method):
+    env = made()
+
+    def by_kind(seen, info):
+        number = int(seen["observation"][0])
+        return 2 - number % 3 if info["agent"] == "right" else RULE
+
+    bases = {"right": lambda seen: 2 - int(seen[0]) % 3}
+    told = action_values(env, futures=2, base=bases, method=method)
+    table = [
+        [by_hand(env, action, seed, base=by_kind) for seed in futures_of(env, 2)]
+        for action in range(3)
+    ]
+    assert told.returns == pytest.approx(np.array(table))
+    with pytest.raises(UnknownAgentError, match="'middle'"):
+        action_values(env, base={"middle": RULE})
+    env = begun(TransformAction(made(), lambda action: action, spaces.Discrete(2)))
+    with pytest.raises(OptionValueError, match="no wrapper has replaced"):
+        action_values(env, base=bases)
+
+
+@ONE_FUTURE
+def test_actions_of_bases_by_agent_are_translated_and_checked():
+    ant = decision(agent="ant_0", action_space=spaces.Discrete(2, start=5))
+    bee = decision(
+        agent="bee_0",
+        action_space=spaces.Box(0, 4, (1,), np.float32),
+        action_space_mapping=lambda action: action.tolist(),
+        reward_mapping=lambda: 1.0,
+    )
+    env = begun(turn_env(calling(bee, ant, bee, ant), [ant, bee]))
+    first = np.array([0.0, 0.0, -1.0], np.float32)
+    logs = []
+
+    def note(env):
+        logs.append(env.simulation.log)
+        return 0.0
+
+    bases = {"ant_0": lambda seen: 6, "bee_0": lambda seen: np.array([3.0], np.float32)}
+    given = {"futures": 1, "method": "replay", "horizon": 3, "terminal_value": note}
+    action_values(env, [first], base=bases, **given)
+    assert logs == [[[0.0], 6, [3.0]]]
+    for wrong in ({"ant_0": lambda seen: 0}, {"bee_0": lambda seen: np.array([5.0], np.float32)}):
+        with pytest.raises(InvalidActionError, match="not in"):
+            action_values(env, [first], base=bases | wrong, **given)
+
+
+@ONE_FUTURE
+def test_candidates_are_the_legal_actions_of_the_one_that_decides():
+    mask = np.array([1, 0, 1], np.int8)
+    ant = decision(
+        agent="ant_0", action_space=spaces.Discrete(3, start=4), action_mask_mapping=lambda: mask
+    )
+    bee = decision(agent="bee_0", action_space=spaces.Discrete(5))
+    env = begun(turn_env(calling(ant, bee), [ant, bee]))
+    assert action_values(env, futures=1).actions == (0, 2)
+    for wrong, match in ((1, "mask"), (3, "has 3 of the 5"), (5, "has 3 of the 5")):
+        with pytest.raises(InvalidActionError, match=match):
+            action_values(env, [0, wrong])
+    assert RolloutPolicy([0, 1, 3]).choose(env).actions == (0,)
+    with pytest.raises(InvalidActionError, match="not in"):
+        RolloutPolicy([0, 5]).choose(env)
+    env.step(0)
+    assert action_values(env, futures=1).actions == (0, 1, 2, 3, 4)
+    amount = decision(action_space=spaces.Box(0, 1, (1,), np.float32))
+    env = begun(turn_env(calling(amount), [amount], clip_actions=True))
+    with pytest.raises(OptionValueError, match="Discrete"):
+        action_values(env)
+    assert len(action_values(env, [np.array([2.0])], futures=1).means) == 1
+
+
+@METHODS
+def test_wrappers_of_turn_views_take_part(method):
+    env = made()
+    seeds = futures_of(env, 2)
+    table = [
+        [by_hand(env, action, seed, base=RULE, horizon=3) for seed in seeds] for action in range(3)
+    ]
+    wrapped = TransformReward(PassiveEnvChecker(env), lambda reward: -reward)
+    wrapped = begun(OrderEnforcing(wrapped))
+    told = action_values(wrapped, futures=2, horizon=3, method=method)
+    assert told.returns == pytest.approx(-np.array(table))
+
+
+def in_turn(actions):
+    """A policy that takes some actions, and then follows the rule."""
+    left = iter(actions)
+    return lambda *_: next(left, RULE)
+
+
+@METHODS
+@ONE_FUTURE
+def test_trees_of_turn_views_find_the_best_sequence(method):
+    env = made(Unseeded)
+    planner = TreeSearchPolicy([0, 2], depth=3, budget=60, horizon=4, margin=0, method=method)
+    values = {}
+    for path in product([0, 2], repeat=3):
+        values[path] = by_hand(env, path[0], None, base=in_turn(path[1:]), horizon=4)
+    told = planner.choose(env)
+    best = max(values, key=values.get)
+    assert (told.actions, told.best) == ((0, 2, RULE), best[0])
+    assert np.nanmax(told.returns) == pytest.approx(values[best])
+    assert branch(env, lambda twin, number: planner.choose(twin).best, method=method) == [best[0]]
+    chance = TreeSearchPolicy([0, 2], depth=2, futures=8, margin=0, method=method)
+    assert chance.choose(made()).best == 2  # because the first move pays the one on the left alone

@@ -175,7 +175,7 @@ def own_costs(policy: Policy, *, _simulation: SerialSupply) -> float:
 def place(action: Any, policy: Policy, position: float) -> float:
     """Return the quantity that a stage orders: as much as it wants and has room for."""
     room = ROOM[policy.node.index - 1] - position
-    return max(0.0, min(float(np.ravel(action)[0]), room))
+    return float(max(0.0, min(np.ravel(action)[0], room)))
 
 
 order = make_step(

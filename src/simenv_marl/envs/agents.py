@@ -4,8 +4,7 @@ from functools import cached_property
 from typing import Any
 
 from ..core import Plan, Space
-from ..errors import ViewError
-from .base import View
+from .base import View, refuse_unknown_agents
 
 
 class AgentsView(View):
@@ -20,11 +19,7 @@ class AgentsView(View):
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view."""
-        if isinstance(plan.options.state_space, str) and not plan.complete:
-            raise ViewError(
-                'state_space="observations" needs to know all agents beforehand: declare them in'
-                " possible_agents="
-            )
+        refuse_unknown_agents(plan)
         return super().adapt(plan)
 
     @classmethod

@@ -72,6 +72,15 @@ _NOT_COPIED = frozenset(
 """The attributes that each view makes for itself."""
 
 
+def refuse_unknown_agents(plan: Plan) -> None:
+    """Raise a ``ViewError`` if observations are the state, and not all agents are known."""
+    if isinstance(plan.options.state_space, str) and not plan.complete:
+        raise ViewError(
+            'state_space="observations" needs to know all agents beforehand: declare them in'
+            " possible_agents="
+        )
+
+
 class View:
     """A view of a simulation's episodes.
 

@@ -28,7 +28,7 @@ from ..core import (
 from ..decision import DecisionPoint
 from ..errors import ViewError, short_repr
 from ..simulation import RULE
-from .base import OneAgentView, StepResult
+from .base import OneAgentView, StepResult, refuse_unknown_agents
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""
@@ -177,6 +177,7 @@ class SimulationTurnEnv(OneAgentView):
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and let agents decide at points of any spaces."""
+        refuse_unknown_agents(plan)
         return super().adapt(replace(plan, unites=True))
 
     @classmethod

@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Tests start hundreds of processes, each of which would compile the library anew where this is set.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-clients test-benchmarl test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -64,9 +64,12 @@ soak: .venv/.test
 # their own virtual environments.
 CLIENTS ?= tests/clients
 RECIPES := tests/clients/test_serial_supply.py -k recipe
-test-clients: .venv-clients/.clients .venv-benchmarl/.benchmarl
+test-clients: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest $(CLIENTS) \
 	    --ignore tests/clients/test_rllib.py --ignore tests/clients/test_supersuit.py
+	test "$(CLIENTS)" != tests/clients || $(MAKE) test-benchmarl
+
+test-benchmarl: .venv-benchmarl/.benchmarl
 	OMP_NUM_THREADS=1 .venv-benchmarl/bin/python -m pytest $(RECIPES)
 
 test-rllib: .venv-rllib/.rllib

@@ -165,7 +165,7 @@ def test_numbers_share_the_largest_space_and_a_mask():
     _, info = env.reset()
     assert info["action_mask"].tolist() == [0, 1, 0, 0]
     assert env.action_masks().tolist() == [False, True, False, False]
-    for action, match in ((0, "mask"), (2, "has 2 of the 4 actions"), (4, "has 2 of the 4")):
+    for action, match in ((0, "mask"), (2, "has 2 of the 4 actions"), (4, "is not in Discrete")):
         with pytest.raises(InvalidActionError, match=match):
             env.step(action)
     *_, info = env.step(1)

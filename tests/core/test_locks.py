@@ -6,7 +6,6 @@ import threading
 import time
 import warnings
 from functools import cached_property
-from queue import SimpleQueue
 
 import pytest
 
@@ -178,15 +177,6 @@ class Sleeps(Model):
         TIMERS.append(timer)
 
 
-class Queues(Sleeps):
-    def run(self):
-        queue = SimpleQueue()
-        self.later(lambda: queue.put(1))
-        queue.get()
-        with self.lock:
-            self.decide()
-
-
 class Lends(Sleeps):
     """A lock of each object, that a thread releases."""
 
@@ -214,28 +204,17 @@ class Leaves(Sleeps):
             self.decide()
 
 
-class Tries(Model):
-    def work(self):
-        if self.lock.acquire(timeout=0.4):
-            self.lock.release()
-        self.decide()
-
-
 @DRIVERS
-@pytest.mark.parametrize("model", [Sleeps, Queues, Lends, Leaves, Tries])
+@pytest.mark.parametrize("model", [Sleeps, Lends, Leaves])
 def test_a_wait_that_ends_by_itself_is_not_told(driver, model, capfd):
     first = env_of(Leaves if model is Leaves else Lends if model is Lends else Model, driver)
     second = env_of(model, driver)
-    if model is Tries:
-        Model.lock.acquire()
     first.reset()
     second.reset()
     if model is Leaves:
         second.step(0)
     second.close()
     first.close()
-    if model is Tries:
-        Model.lock.release()
     while TIMERS:
         TIMERS.pop().join()
     assert capfd.readouterr().err == ""

@@ -8,6 +8,7 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
+    SimulationInterface,
     difference,
     evaluate,
     joint_env,
@@ -168,13 +169,9 @@ def test_evaluations_and_collections_take_a_policy_for_all():
         heat = simulate(Bakery, turn_policy(predict, like=env), points=POINTS, seed=seed).heat
         assert table.loc[("turn", seed), "metric"] == heat
         assert table.loc[("joint", seed), "metric"] == table.loc[("rule", seed), "metric"] == 0.0
-    bakes = dict([next(iter(POINTS.items()))])
-    oven_env = turn_env(Bakery, bakes)
-    (trajectories,) = collect_episodes(
-        Bakery, turn_policy(lambda observation: 1, like=oven_env), seeds=SEEDS, points=bakes
-    ).values()
-    assert set(trajectories.names) == {"oven_0", "oven_1"}
-    assert set(trajectories.actions.tolist()) == {1}
+    found = collect_episodes(Bakery, turn_policy(predict, like=env), seeds=SEEDS, points=POINTS)
+    names = {key.rpartition(".")[2]: set(each.names) for key, each in found.items()}
+    assert names == {"bake": {"oven_0", "oven_1"}, "sell": {"shop"}}
 
 
 def test_beside_one_agent_a_turn_policy_answers_all_others():
@@ -232,3 +229,40 @@ def test_the_teams_reward_counts_once_in_evaluations(tmp_path):
             heat = simulate(Bakery, contenders["turn"], points=POINTS, seed=seed).heat
             assert teams["turn", seed] == pytest.approx(heat)
             assert teams["rule", seed] == 0.0
+
+
+class Pair(SimulationInterface):
+    """Two animals decide in rounds. The first one dies."""
+
+    def reset(self, seed: int | None = None) -> None:
+        self.ages = {"ant": 0, "bee": 0}
+        self.trace: list[int] = []
+
+    def run(self) -> None:
+        for day in range(6):
+            for name in list(self.ages):
+                self.trace.append(self.act(name))
+                self.ages[name] += 1
+            if day == 2:
+                self.end_agent("ant")
+                del self.ages["ant"]
+
+    def act(self, name: str) -> int:
+        return 0
+
+
+def test_a_joint_policy_sees_the_last_observation_of_agents_that_have_ended():
+    points = {
+        f"{__name__}.Pair.act": define(
+            agent=lambda pair, name: name,
+            observation_space_mapping=lambda pair, name: [pair.ages.get(name, 9), 0],
+        )
+    }
+    env = joint_env(Pair, points, possible_agents=["ant", "bee"])
+
+    def answer(observation, info=None):
+        return {"ant": 0, "bee": int(observation["ant"][0])}
+
+    expected = played(env, answer, 0)
+    policies = joint_policy(answer, like=env)
+    assert simulate(Pair, policies, points=points).trace == expected

@@ -45,6 +45,7 @@ from ..many.batch import (
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
 from ..simulation import (
+    EVERYONE,
     RULE,
     Action,
     Model,
@@ -119,13 +120,14 @@ def collect_episodes(
             ``state_space`` or ``state_in_info``, the trajectories have ``states``.
 
     Returns:
-        A dict from each key of ``policies`` to the trajectories of the agents of its policy.
+        A dict from each key of ``policies`` to the trajectories of the agents of its policy. Of a
+        policy for all agents (``turn_policy``): from the name of each decision point.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
         BaseException: Any other error of ``simulate_many``.
     """
-    policies = checked_policies(policies)
+    policies = _by_point(simulation, checked_policies(policies), points, options)
     seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
     make_plan = partial(learners_plan, simulation, policies, points, options)
@@ -140,6 +142,20 @@ def collect_episodes(
         key: combine([records[place] for records, *_ in parts], tuple(seed_list), collected, errors)
         for place, key in enumerate(policies)
     }
+
+
+def _by_point(
+    simulation: Model, policies: Policies, points: Points, options: Mapping[str, Any]
+) -> Policies:
+    """Return policies with one for each point in place of one for all agents.
+
+    The points of one learner may have different spaces, so each has trajectories of its own.
+    """
+    if EVERYONE not in policies:
+        return policies
+    plan = learners_plan(simulation, policies, points, options)
+    named = dict.fromkeys([point.hook.name for point in plan.points], policies[EVERYONE])
+    return named | {key: policy for key, policy in policies.items() if key is not EVERYONE}
 
 
 @dataclass(frozen=True)

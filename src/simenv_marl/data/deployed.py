@@ -152,6 +152,8 @@ class TurnPolicy(_Deployed):
         stack = stacker(self._turn.observation_space, cast=True)
         seen = stack([self._turn.observe(agent) for agent in agents])
         told: Info = {"agent": [agent.name for agent in agents]}
+        if all("time" in info for info in infos):
+            told["time"] = np.array([info["time"] for info in infos])
         if self._turn.has_masks:
             masks: list[Any] = [self._turn.mask(agent) for agent in agents]
             told[MASK] = np.stack(masks)
@@ -181,6 +183,7 @@ class JointPolicy(_Deployed):
     """A policy for all agents of a learner of the joint view: see ``joint_policy``."""
 
     looks_back = True
+    sees_all = True
 
     def __init__(self, predict: Predict, plan: Plan) -> None:
         super().__init__(predict, plan)

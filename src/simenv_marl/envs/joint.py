@@ -273,7 +273,8 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
         ]
         starts = [np.atleast_1d(space.start) for space in parts]
         return spaces.MultiDiscrete(np.concatenate(sizes), start=np.concatenate(starts))
-    for space in parts:
+    # A Discrete comes last, because it may stand beside vectors.
+    for space in sorted(parts, key=lambda part: isinstance(part, spaces.Discrete)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
                 "flatten=True needs one-dimensional Box and Discrete spaces, or actions that are"

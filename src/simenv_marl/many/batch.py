@@ -133,7 +133,9 @@ class PolicyKey(DeferredPolicy):
         self.batch_policy = batch_policy
         policy = batch_policy.policy
         self.takes_state = batch_policy.takes_state
-        self.looks_back = isinstance(policy, EpisodePolicy) and policy.looks_back
+        if isinstance(policy, EpisodePolicy):
+            self.looks_back = policy.looks_back
+            self.sees_all = policy.sees_all
 
     def answer(
         self,

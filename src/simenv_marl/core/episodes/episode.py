@@ -521,10 +521,12 @@ class Episode(EpisodeState):
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on.
 
-        An agent that is none of the environment is observed for the last time, if states need it.
+        An agent that a policy answers is observed for the last time, if others see that.
         """
         is_other = agent.delegated
-        if is_other and not self._observes:
+        policy = agent.policy
+        is_seen = self._observes or (isinstance(policy, EpisodePolicy) and policy.sees_all)
+        if is_other and not is_seen:
             return
         latest = self.latest
         self.latest = agent

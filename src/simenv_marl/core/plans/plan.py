@@ -444,8 +444,8 @@ def _resolve(subject: Subject, options: Options) -> Plan:
     everyone = (options.policies or {}).get(EVERYONE)
     if has_user and everyone is not None and options.agent is None:
         raise OptionValueError(
-            "a policy for all agents leaves no decision to the environment; name the agent that its"
-            " user answers with agent="
+            "a policy for all agents leaves no decision to the environment; make a single_env, and"
+            " name the agent that its user answers with agent="
         )
     default = subject.default_policy if has_user or everyone is None else everyone
     points: list[Point] = []

@@ -235,6 +235,7 @@ class EpisodePolicy(ABC):
         waits: Whether it must be awaited.
         batched: Whether it answers many decisions in one call, where many wait.
         looks_back: Whether it needs the arguments of decisions that were answered before.
+        sees_all: Whether it sees all agents, so that those that end are observed for the last time.
         takes_state: Whether it needs the state of the simulation.
         policy: The user's policy, for errors.
     """
@@ -242,6 +243,7 @@ class EpisodePolicy(ABC):
     waits = False
     batched = False
     looks_back = False
+    sees_all = False
     takes_state = False
     policy: Policy
 

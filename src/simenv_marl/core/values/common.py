@@ -170,7 +170,9 @@ class _Numbered:
 
     def decode(self, action: Action, mask: Mask | None) -> Action:
         number = self._check(action)
-        if number is ILLEGAL or number >= self._own.n:
+        if number is ILLEGAL:
+            raise InvalidActionError(f"{short_repr(action)} is not in Discrete({self._most})")
+        if number >= self._own.n:
             raise InvalidActionError(
                 f"{short_repr(action)} is not an action of the agent, which has {self._own.n} of"
                 f" the {self._most} actions"

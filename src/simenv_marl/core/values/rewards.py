@@ -15,7 +15,7 @@ def checked_reward(name: str, reward: Model) -> float:
     """Return a reward as a float. Raise a ``RewardError`` if it is not one finite number."""
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
-        raise RewardError(f"the reward {short_repr(reward)} is not one number")
+        raise RewardError(f"the reward {short_repr(reward)} of {name!r} is not one number")
     try:
         number = float(value)
     except OverflowError:

@@ -216,14 +216,12 @@ def test_the_teams_reward_counts_once_in_evaluations(tmp_path):
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     contenders = {"rule": {}, "turn": turn_policy(predict, like=env)}
     options = {"points": POINTS, "team_reward": difference(lambda bakery: bakery.heat)}
-    result = evaluate(Bakery, contenders, seeds=SEEDS, metric=lambda s: s.heat, **options)
-    table = run_experiment(
-        Bakery, [{}], contenders=contenders, seeds=SEEDS, store=tmp_path, **options
-    )
-    again = run_experiment(
-        Bakery, [{}], contenders=contenders, seeds=SEEDS, store=tmp_path, **options
-    )
-    for frame in (result.frame, table, again):
+    result = evaluate(Bakery, contenders, seeds=SEEDS, **options)
+    tables = [
+        run_experiment(Bakery, [{}], contenders=contenders, seeds=SEEDS, store=tmp_path, **options)
+        for _ in range(2)
+    ]
+    for frame in (result.frame, *tables):
         teams = frame[frame.agent == "team"].set_index(["contender", "seed"])["return"]
         for seed in SEEDS:
             heat = simulate(Bakery, contenders["turn"], points=POINTS, seed=seed).heat

@@ -19,7 +19,6 @@ from ..core import (
     Observation,
     Plan,
     is_asked_alone,
-    split_batch,
     stacker,
     takes_state,
 )
@@ -27,7 +26,8 @@ from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..envs.base import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
-from ..errors import InvalidActionError, OptionValueError, UnknownAgentError, short_repr
+from ..errors import OptionValueError, UnknownAgentError, short_repr
+from ..many.batch import read_answers
 from ..simulation import EVERYONE, RULE
 
 Predict = Callable[..., Any]
@@ -157,13 +157,8 @@ class TurnPolicy(_Deployed):
         if self._turn.has_masks:
             masks: list[Any] = [self._turn.mask(agent) for agent in agents]
             told[MASK] = np.stack(masks)
-        answers, extras = self._ask(seen, told, self._turn.action_space, states)
-        actions = split_batch(answers, integers=True)
-        if actions is None or len(actions) != len(agents):
-            raise InvalidActionError(
-                f"{short_repr(self.policy)} was asked for {len(agents)} decisions at once, and"
-                f" returned {short_repr(answers)}"
-            )
+        answers = self._ask(seen, told, self._turn.action_space, states)
+        actions, extras = read_answers(answers, self.policy, len(agents))
         return list(map(self._own, agents, actions)), extras
 
     def _info(self, agent: Agent, info: Info) -> Info:

@@ -4,7 +4,17 @@ from functools import cached_property
 from typing import Any
 
 from ..core import Plan, Space
-from .base import View, refuse_unknown_agents
+from ..errors import ViewError
+from .base import View
+
+
+def refuse_unknown_agents(plan: Plan) -> None:
+    """Raise a ``ViewError`` if observations are the state, and not all agents are known."""
+    if isinstance(plan.options.state_space, str) and not plan.complete:
+        raise ViewError(
+            'state_space="observations" needs to know all agents beforehand: declare them in'
+            " possible_agents="
+        )
 
 
 class AgentsView(View):

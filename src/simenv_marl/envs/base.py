@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import (
     Any,
@@ -70,15 +70,6 @@ _NOT_COPIED = frozenset(
     ("_finalizer", "_lock", "_roster", "joint", "own_agent", "own_seat", "session", "turn")
 )
 """The attributes that each view makes for itself."""
-
-
-def refuse_unknown_agents(plan: Plan) -> None:
-    """Raise a ``ViewError`` if observations are the state, and not all agents are known."""
-    if isinstance(plan.options.state_space, str) and not plan.complete:
-        raise ViewError(
-            'state_space="observations" needs to know all agents beforehand: declare them in'
-            " possible_agents="
-        )
 
 
 class View:
@@ -539,6 +530,17 @@ class OneAgentView(View, gym.Env[Any, Any]):
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Prepare for a new episode; return the results of its reset."""
         raise NotImplementedError
+
+    def read(self, episode: EpisodeState) -> StepResult:
+        """Return the results of a step."""
+        raise NotImplementedError
+
+    @classmethod
+    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
+        """Return the observations, rewards and infos of the latest step of several views."""
+        results = [view.read(view.episode) for view in views]
+        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
+        return observations, rewards, infos
 
     def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
         """Return how an episode has ended: whether terminated, whether truncated."""

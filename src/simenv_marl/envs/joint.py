@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -237,13 +237,6 @@ class SimulationJointEnv(OneAgentView):
         if episode.over:
             self.warn_of_losses(episode)
         return results
-
-    @classmethod
-    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
-        """Return the observations, rewards and infos of the latest step of several views."""
-        results = [view.read(view.episode) for view in views]
-        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
-        return observations, rewards, infos
 
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""

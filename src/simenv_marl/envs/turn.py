@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from math import exp
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -28,7 +28,8 @@ from ..core import (
 from ..decision import DecisionPoint
 from ..errors import ViewError, short_repr
 from ..simulation import RULE
-from .base import OneAgentView, StepResult, refuse_unknown_agents
+from .agents import refuse_unknown_agents
+from .base import OneAgentView, StepResult
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""
@@ -289,13 +290,6 @@ class SimulationTurnEnv(OneAgentView):
         rate = episode.plan.options.discount_rate
         if rate is not None:
             info["discount"] = exp(-rate * elapsed)
-
-    @classmethod
-    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
-        """Return the observations, rewards and infos of the latest step of several views."""
-        results = [view.read(view.episode) for view in views]
-        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
-        return observations, rewards, infos
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""

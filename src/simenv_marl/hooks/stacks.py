@@ -151,7 +151,7 @@ def _refuse_after_fork() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    # A fork waits for the changes of other threads, because nobody would complete them there.
+    # A fork waits for the changes of other threads, because no thread would complete them there.
     os.register_at_fork(
         before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=_refuse_after_fork
     )

@@ -268,7 +268,7 @@ class EpisodeState:
         return is_open and isinstance(name, str)
 
     def find(self, name: str) -> Agent | None:
-        """Return an agent, whoever answers it. None if it has not appeared."""
+        """Return an agent that the user or a policy answers. None if it has not appeared."""
         return self.agent(name) or self.others.get(name)
 
     def note_first_decision(self) -> None:

@@ -72,7 +72,7 @@ def test_the_simulation_passes_the_checks():
     check_simulation(SerialSupply, **OPTIONS).raise_for_errors()
 
 
-def test_optimal_base_stocks_cost_what_the_book_says_and_the_rule_far_more():
+def test_optimal_base_stocks_cost_as_much_as_in_the_book():
     seeds = range(40)
     best = cost(base_stocks(), seeds)
     assert best == pytest.approx(OPTIMUM, rel=0.02)

@@ -46,7 +46,7 @@ def agents(number=2):
 # -- who gets what --------------------------------------------------------------------------------
 
 
-def test_an_agent_gets_what_the_team_has_earned_since_its_previous_decision():
+def test_an_agent_gets_the_teams_reward_since_its_decision():
     ant, bee = agents()
     team = Counter(100, 1, 2, 4, 8)
     env = aec_env(calling(ant, bee, bee, ant), [ant, bee], team_reward=team)

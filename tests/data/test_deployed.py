@@ -249,7 +249,7 @@ class Pair(SimulationInterface):
         return 0
 
 
-def test_a_joint_policy_sees_the_last_observation_of_agents_that_have_ended():
+def test_a_joint_policy_sees_last_observations_of_ended_agents():
     points = {
         f"{__name__}.Pair.act": define(
             agent=lambda pair, name: name,

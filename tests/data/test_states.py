@@ -381,6 +381,10 @@ def test_states_that_cannot_be_stacked_are_refused():
     ant = decision(agent="ant_0")
     with pytest.raises(NotImplementedError, match=r"no method state\(\)") as caught:
         collect_episodes(
-            calling(ant), {"ant_0": by_row(lambda seen: 1)}, seeds=[4], state_in_info=True
+            calling(ant),
+            {"ant_0": by_row(lambda seen: 1)},
+            seeds=[4],
+            points=ant,
+            state_in_info=True,
         )
     assert "seed 4" in "".join(caught.value.__notes__)

@@ -141,8 +141,9 @@ def test_a_decorator_from_outside_may_run_again(model):
 def test_a_module_on_disk_is_reloaded(tmp_path, monkeypatch):
     (tmp_path / "reloaded_file.py").write_text(HEAD + MODEL, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "reloaded_file", None)  # so the module is removed at the end
+    del sys.modules["reloaded_file"]
     module = importlib.import_module("reloaded_file")
     points = points_of(module, *NAMES)
     assert log_of(aec_env(module.Sim, points)) == [3] * 5
     assert log_of(aec_env(importlib.reload(module).Sim, points)) == [3] * 5
-    monkeypatch.delitem(sys.modules, "reloaded_file")

@@ -126,7 +126,7 @@ GOAL = {"achieved_goal_mapping": list, "desired_goal_mapping": list, "compute_re
             "needs a Discrete or MultiDiscrete",
         ),
         ({"rule_action_mapping": 3}, "rule_action_mapping must be a callable or a dict"),
-        ({"agent": ""}, "agent must be a name"),
+        ({"agent": ""}, "agent must be a text"),
         ({"removed_by": {3: None}}, "removed_by must be a dict from dotted names"),
         (
             {"removed_by": {"package.function": "ant_0"}},

@@ -105,7 +105,9 @@ def summary(costs: pd.DataFrame, trainings: int, folder: Path) -> pd.DataFrame:
         if name in LEARNERS:
             runs = [f"{name}-{seed}" for seed in range(trainings)]
             values = costs[runs].mean().to_numpy()
-            spent = [json.loads((folder / f"{run}.json").read_text())["cpu seconds"] for run in runs]
+            spent = [
+                json.loads((folder / f"{run}.json").read_text())["cpu seconds"] for run in runs
+            ]
         else:
             values, spent = costs[name].to_numpy(), [0]
         low, high = interval(values)

@@ -71,6 +71,8 @@ class Definition:
     compute_reward: Function | None
     action_labels: Labels
     observation_labels: Labels
+    question: str | Mapped | None
+    display_mapping: Mapped | None
 
     def __post_init__(self) -> None:
         """Check the definition, and make callables of dicts; also after ``dataclasses.replace``.
@@ -140,6 +142,8 @@ def make_step(
     compute_reward: Function | None = None,
     action_labels: Labels = None,
     observation_labels: Labels = None,
+    question: str | Mapped | None = None,
+    display_mapping: Mapped | None = None,
 ) -> Definition:
     """Define a decision point: the observations, actions and rewards of its agent.
 
@@ -206,6 +210,12 @@ def make_step(
             callable of the call's arguments that returns one of these. Default: choices and
             decisions as text, else numbers.
         observation_labels: The same for the parts of observations.
+        question: The question that people and language models answer, or a callable of the call's
+            arguments that returns it. Default: "By its rule: " and the first sentence of the
+            function's docstring.
+        display_mapping: A callable of the call's arguments that returns a dict from label to number
+            or text, such as ``{"temperature": "22 °C"}``. People and language models read it
+            instead of the observation. It is called only for them.
 
     Returns:
         The definition, which is a decorator for the function that decides.
@@ -281,8 +291,8 @@ def _required_kind(
         return None if isinstance(part, spaces.Space) else "a gymnasium space"
     if callable(part):
         return None
-    if name == "agent":
-        return None if isinstance(part, str) and part else "a name or a callable"
+    if name in ("agent", "question"):
+        return None if isinstance(part, str) and part else "a text or a callable"
     if name in ("action_space_mapping", "rule_action_mapping"):
         return None if isinstance(part, Mapping) else "a callable or a dict"
     if name.endswith("_labels"):

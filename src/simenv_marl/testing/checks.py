@@ -86,7 +86,7 @@ _TESTS: Final = (
 """The tests and their views; each test is called with a factory of environments."""
 
 _BLAMED: Final[dict[type[SimEnvError], str]] = {
-    DefinitionError: "callable of labels",
+    DefinitionError: "callable of labels, question or display",
     MaskError: "action_mask_mapping, or choices,",
     ObservationError: "observation_space_mapping",
     RewardError: "reward_mapping",

@@ -266,7 +266,8 @@ class Run:
                 for _ in range(drawn):
                     action = env.action_space(name).sample(info.get(MASK))
                 self.actions.append(action)
-                agent.describe(seed, Where.USER)  # which raises an error if labels do not fit
+                # It raises an error if labels do not fit, and so does the display.
+                _ = agent.describe(seed, Where.USER).display
             yield
             env.step(action)
 

@@ -328,7 +328,6 @@ class Agent:
     def describe(self, seed: int, where: Where) -> Decision:
         """Describe the decision of the agent."""
         point = self.point
-        choices = self.choices
         args, kwargs = self.arguments.recall()
         return Decision(
             agent=self.name,
@@ -339,14 +338,16 @@ class Agent:
             observation=duplicate(self.observation),
             action_space=point.definition.action_space,
             mask=None if self.mask is None else duplicate(self.mask),
-            choices=None if choices is None else list(choices),
-            action_labels=point.action_labels(choices, args, kwargs),
+            choices=None if self.choices is None else list(self.choices),
+            action_labels=point.action_labels(self.choices, args, kwargs),
             observation_labels=point.observation_labels(args, kwargs),
             reward=self.reward,
             doc=point.hook.function.__doc__,
+            question=point.question(args, kwargs),
             in_clone=where is not Where.USER,
             memory=self.memory,
             _agent=self,
+            _display=lambda: point.display(*self.arguments.recall()),
         )
 
     # -- arguments --------------------------------------------------------------------------------

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
+from ...errors import NoDecisionError
 from ...simulation import Action, Model, Observation
 from ..plans.point import Labels, Space
 from ..values.actions import Mask
@@ -13,6 +15,9 @@ from ..values.actions import Mask
 
 class DecidingAgent(Protocol):
     """The agent of a decision."""
+
+    answered: int
+    """The number of its decisions that were answered."""
 
     def validate(self, action: Action) -> Action:
         """Validate an action."""
@@ -43,6 +48,7 @@ class Decision:
         observation_labels: The same for the parts of the observation.
         reward: The reward of the agent's previous action; 0.0 at its first decision.
         doc: The docstring of the model's function. None if it has none.
+        question: The question that the decision answers; "" without ``question=`` and docstring.
         in_clone: Whether the environment is a clone or a branch, where policies count nothing.
         memory: A dict where policies remember values of this agent in this episode.
     """
@@ -60,9 +66,24 @@ class Decision:
     observation_labels: Labels
     reward: float
     doc: str | None
+    question: str
     in_clone: bool
     memory: dict[Any, Any] = field(repr=False)
     _agent: DecidingAgent = field(repr=False)
+    _display: Callable[[], dict[str, float | str] | None] = field(repr=False)
+
+    @cached_property
+    def display(self) -> dict[str, float | str] | None:
+        """The result of ``display_mapping=``, called at the first use. None without a mapping.
+
+        Raises:
+            NoDecisionError: The decision was answered before the first use.
+        """
+        if self._agent.answered >= self.number:
+            raise NoDecisionError(
+                f"decision {self.number} of {self.agent!r} was answered; read its display before"
+            )
+        return self._display()
 
     def validate(self, action: Action) -> Action:
         """Validate an action; return it as ``action_space_mapping`` receives it.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Generator, Mapping, Sequence
 from copy import copy
 from functools import partial
+from numbers import Real
 from types import coroutine
 from typing import Any, Final, Protocol, TypeAlias
 
@@ -36,6 +38,9 @@ Labels = Mapping[Any, str] | Sequence[str] | None
 Policy: TypeAlias = "Callable[..., Action] | Model"
 """A policy, as a plan has it: a callable, or ``RULE``."""
 
+_SENTENCE: Final = re.compile(r".+?[.!?](?=\s|$)|.+")
+"""The first sentence of a text in one line."""
+
 _LEADING: Final = {
     "agent": 0,
     "observation_space_mapping": 0,
@@ -44,6 +49,8 @@ _LEADING: Final = {
     "choices": 0,
     "action_labels": 0,
     "observation_labels": 0,
+    "question": 0,
+    "display_mapping": 0,
     "apply": 1,
     "rule_action_mapping": 1,
     "split": 0,
@@ -51,6 +58,9 @@ _LEADING: Final = {
     "part": 2,
 }
 """The callables of a definition that get a call's arguments, and how many come before these."""
+
+_TEXTS: Final = ("action_labels", "observation_labels", "question", "display_mapping")
+"""The callables of a definition that are only for people and language models."""
 
 _WITHOUT_ITEM = ("split", "gather", "part")
 """The callables of a definition that do not get an item of a split call first."""
@@ -187,8 +197,8 @@ class Point:
         self.takes_for_reward = fitted["reward_mapping"]
         makes_observation = ("observation_space_mapping", "action_mask_mapping", "choices")
         self.takes_for_observation = [fitted[name] for name in makes_observation if name in fitted]
-        labels = [mapped for name, mapped in fitted.items() if name.endswith("_labels")]
-        taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *labels])
+        texts = [fitted[name] for name in _TEXTS if name in fitted]
+        taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *texts])
         self.taken_places: int | None = None
         self.taken_keys = taken
         if taken is not None:
@@ -327,6 +337,40 @@ class Point:
         named = {part: texts.get(part, str(part)) for part in parts}
         has_keys = isinstance(space, (gym_spaces.Discrete, gym_spaces.Dict))
         return named if has_keys else tuple(named.values())
+
+    # -- questions --------------------------------------------------------------------------------
+
+    def question(self, args: Args, kwargs: Kwargs) -> str:
+        """Return the question of a call. Default: the first sentence of the rule's docstring."""
+        question = self.definition.question
+        if callable(question):
+            question = self._calls["question"](*args, **kwargs)
+            if not isinstance(question, str):
+                raise DefinitionError(
+                    f"question of {self.hook.name} has returned {short_repr(question)}, which is no"
+                    " text"
+                )
+        if question is not None:
+            return question
+        doc = inspect.getdoc(self.hook.function) or ""
+        sentence = _SENTENCE.match(" ".join(doc.partition("\n\n")[0].split()))
+        return f"By its rule: {sentence[0]}" if sentence else ""
+
+    def display(self, args: Args, kwargs: Kwargs) -> dict[str, float | str] | None:
+        """Return the labelled numbers and texts of a call. None without a ``display_mapping``."""
+        mapping = self._calls.get("display_mapping")
+        if mapping is None:
+            return None
+        shown = mapping(*args, **kwargs)
+        if not isinstance(shown, Mapping) or not all(
+            isinstance(label, str) and isinstance(value, (str, Real, np.bool))
+            for label, value in shown.items()
+        ):
+            raise DefinitionError(
+                f"display_mapping of {self.hook.name} has returned {short_repr(shown)}, which is no"
+                " dict from texts to numbers or texts"
+            )
+        return dict(shown)
 
     # -- actions ----------------------------------------------------------------------------------
 

@@ -161,6 +161,27 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
     assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
+def test_fallbacks_are_a_share_of_the_decisions_of_their_policy():
+    async def counting(observation, *, _decision):
+        _decision.count(tokens=3, words=1)
+        return await sometimes(observation, _decision=_decision)
+
+    contenders = {"guarded": {"filler": FallbackPolicy(counting)}, "plain": {"filler": one}}
+    found = evaluate(Tank, contenders, seeds=range(4), points=POINTS)
+    assert found.summary()["fallbacks"].tolist() == [0.1, 0.0]
+    seats = found.seats.set_index(["contender", "agent"])
+    assert seats.loc[("guarded", "filler"), "seconds"] > 0
+    assert seats.drop(columns=["seconds", "failed"]).to_dict("index") == {
+        ("guarded", "filler"): {
+            "decisions": 20, "asked": 20, "fallbacks": 2, "tokens": 60, "words": 20
+        },
+        **{
+            key: {"decisions": 20, "asked": 0, "fallbacks": 0, "tokens": 0, "words": 0}
+            for key in (("guarded", "drainer"), ("plain", "filler"), ("plain", "drainer"))
+        },
+    }  # fmt: skip
+
+
 def test_contenders_with_many_fallbacks_are_marked():
     contenders = {
         "bad": {"filler": FallbackPolicy(raises)},

@@ -212,11 +212,11 @@ class LanguageModelPolicy:
         finally:
             count(self._token, requests=1, seconds=perf_counter() - start)
         usage = getattr(response, "usage", None)
-        count(
-            self._token,
-            prompt_tokens=getattr(usage, "prompt_tokens", 0) or 0,
-            completion_tokens=getattr(usage, "completion_tokens", 0) or 0,
-        )
+        tokens = {
+            name: getattr(usage, name, 0) or 0 for name in ("prompt_tokens", "completion_tokens")
+        }
+        count(self._token, **tokens)
+        decision.count(tokens=sum(tokens.values()))
         try:
             message = response.choices[0].message
         except (AttributeError, LookupError, TypeError):

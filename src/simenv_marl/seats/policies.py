@@ -121,7 +121,6 @@ class FallbackPolicy(PolicyWrapper):
             except Exception as error:
                 self._note(decision, "failed", error)
         self._count(decision, "fallbacks")
-        decision.count_fallback()
         answer = self._ask_fallback(*arguments)
         if isawaitable(answer):
             return await answer
@@ -153,6 +152,7 @@ class FallbackPolicy(PolicyWrapper):
     def _count(self, decision: Decision, kind: str) -> None:
         if not decision.in_clone:
             count(self._token, **{kind: 1})
+            decision.count(**{kind: 1})
 
 
 def _leave_to_rule(observation: Observation) -> Action:

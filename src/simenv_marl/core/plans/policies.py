@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
+from time import perf_counter
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 from ...errors import OptionValueError, short_repr
@@ -70,6 +71,9 @@ class AskedAgent(Protocol):
 
     def describe(self, seed: int, where: Where) -> object:
         """Return the decision of the agent, for a policy that asks for it."""
+
+    def count(self, **numbers: float) -> None:
+        """Add numbers to its counts."""
 
 
 ASKED: Final = ("_environment", "_decision", "_state")
@@ -324,4 +328,13 @@ class AskingPolicy(EpisodePolicy):
             asked[ASKED[1]] = agent.describe(episode.seed, episode.where)
         if ASKED[2] in call.names:
             asked[ASKED[2]] = episode.read_state()
-        return call(observation, info, asked)
+        if not asked:  # a quick policy, as a rule
+            return call(observation, info, asked)
+        start = perf_counter()
+
+        def conclude(answer: Action) -> Action:
+            agent.count(seconds=perf_counter() - start)
+            return answer
+
+        answer = call(observation, info, asked)
+        return when_answered(answer, conclude) if self.waits else conclude(answer)

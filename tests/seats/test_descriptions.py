@@ -1,7 +1,9 @@
 """Pending decisions as text and as JSON, and texts as actions, by the labels of the model."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -160,6 +162,62 @@ def test_choices_and_decisions_are_labels_where_none_are_given():
     assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
 
 
+class Move(NamedTuple):
+    piece: str
+    hours: float
+
+
+@dataclass
+class Job:
+    number: int
+    start: float
+    owner: object = field(default=None, repr=False)
+
+
+class Plain:
+    pass
+
+
+class Named:
+    def __str__(self):
+        return "by name"
+
+
+CHOICES = {
+    "numbers": ([np.float64(8.0), np.int64(3), np.float32(0.1)], ["8.0", "3", "0.1"]),
+    "records": (
+        [Move("rook", np.float64(8.0)), Job(2, np.float32(0.1)), Named()],
+        ["Move(piece='rook', hours=8.0)", "Job(number=2, start=0.1)", "by name"],
+    ),
+    "containers": (
+        [(np.int64(1), "a"), [np.float64(0.5)], {"x": np.float64(2.0)}],
+        ["(1, 'a')", "[0.5]", "{'x': 2.0}"],
+    ),
+    "equal": ([Plain(), Plain(), "Plain (1)"], ["Plain (0)", "Plain (1) (1)", "Plain (1) (2)"]),
+    "like numbers of actions": (["2", "2"], ["2 (0)", "2 (1)"]),
+    "blank": (["", " "], ["''", "' '"]),
+}
+
+
+@pytest.mark.parametrize("kind", CHOICES)
+def test_choices_are_labelled_exactly_and_each_in_another_way(kind):
+    choices, labels = CHOICES[kind]
+    env = env_of(
+        replace(FILL, action_labels=None, action_space_mapping=None, choices=lambda tank: choices)
+    )
+    assert describe(env, as_json=True)["actions"]["enum"] == labels
+    assert [parse(env, label) for label in labels] == list(range(len(labels)))
+
+
+def test_equal_decisions_and_actions_without_a_label_are_told_apart():
+    equal = replace(FILL, action_labels=None, action_space_mapping={0: "no", 1: [2], 2: "no"})
+    assert describe(env_of(equal), as_json=True)["actions"]["enum"] == ["no (0)", "[2]", "no (2)"]
+    some = replace(
+        FILL, action_labels=lambda tank: {0: "1"}, action_space_mapping=lambda action: 1.0
+    )
+    assert describe(env_of(some), as_json=True)["actions"]["enum"] == ["1", "1 (1)", "2"]
+
+
 def test_labels_may_be_made_for_each_call():
     env = env_of(
         replace(
@@ -167,7 +225,7 @@ def test_labels_may_be_made_for_each_call():
         )
     )
     assert parse(env, "2 of 5.0") == 2
-    for labels in (["one"], {1: "one", 2: "two", 3: "three"}):
+    for labels in (["one"], {1: "one", 2: "two", 3: "three"}, ["one", "two", "one"]):
         bad = env_of(replace(FILL, action_labels=lambda tank, labels=labels: labels))
         with pytest.raises(
             DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"
@@ -265,8 +323,15 @@ def test_timelines_name_actions_by_their_labels():
     assert "half" in {label.get_text() for one in axes for label in one.get_yticklabels()}
 
 
+class Valve(Enum):
+    CLOSED = 0
+    HALF = 1
+    OPEN = 2
+
+
 @pytest.mark.parametrize("labels", [
     *[{"action_labels": labels} for labels in (["a", "b"], {0: "a", 1: "b"}, "abc", ["a", "b", 3])],
+    *[{"action_labels": labels} for labels in (["a", "b", "a"], ["a", "b", " "], Valve)],
     *[{"observation_labels": labels} for labels in (["a", "b"], {"level": "a"})],
     {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
     {"observation_labels": ["a", "b"], "observation_space": spaces.Box(0, 1, (2, 2))},

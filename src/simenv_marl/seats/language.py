@@ -23,7 +23,8 @@ from ..errors import (
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation, check_count
 from . import descriptions
-from .descriptions import Schema, action_schema, at_decision, parse
+from .answers import parse
+from .descriptions import Schema, action_schema, at_decision
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""

@@ -22,7 +22,7 @@ from ..errors import (
     warn_user,
 )
 from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
-from .descriptions import to_action
+from .answers import to_action
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 """The events that a ``FallbackPolicy`` counts."""

@@ -13,7 +13,17 @@ from uuid import uuid4
 
 import numpy as np
 
-from ..core import COUNTS, Caller, Decision, Info, PolicyWrapper, count, waits, when_answered
+from ..core import (
+    COUNTS,
+    Caller,
+    Decision,
+    Info,
+    PolicyWrapper,
+    count,
+    split_extras,
+    waits,
+    when_answered,
+)
 from ..errors import (
     InvalidActionError,
     OptionValueError,
@@ -109,8 +119,9 @@ class FallbackPolicy(PolicyWrapper):
                 self._count(decision, "retried")
             try:
                 answer = await self._ask_in_time(*arguments)
-                if answer is not RULE:
-                    decision.validate(answer)
+                action, _ = split_extras(answer, decision.action_space)
+                if action is not RULE:
+                    decision.validate(action)
                 return answer
             except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
@@ -267,8 +278,9 @@ class RecordedPolicy(PolicyWrapper):
         answer: Action,
         decision: Decision,
     ) -> Action:
-        """Record an answer, unless it is illegal, and return it."""
+        """Record an answer, unless it is illegal, and return it without extras."""
         recorded = None
+        answer, _ = split_extras(answer, decision.action_space)
         if answer is not RULE:
             try:
                 action = decision.validate(answer)

@@ -16,6 +16,8 @@ from functools import partial
 from time import perf_counter
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
+from gymnasium.spaces import Tuple
+
 from ...errors import OptionValueError, short_repr
 from ...simulation import RULE, Action, Observation, asks_for, positional
 from ..switching.awaiting import wait_for
@@ -209,7 +211,7 @@ def split_extras(answer: Action, space: Space | None = None) -> tuple[Action, Ma
     ``space``: the space of one action, because an action of a ``Tuple`` may look like both.
     """
     is_pair = type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping)
-    if is_pair and not (space is not None and space.contains(answer)):
+    if is_pair and not (isinstance(space, Tuple) and space.contains(answer)):
         action, extras = answer
         return action, extras
     return answer, {}

@@ -33,25 +33,13 @@ from .descriptions import JSON, at_decision, label_of_part, legal_lines
 MISFITS: Final = (ValueError, TypeError, LookupError, OverflowError, RecursionError)
 """The errors of values that are no actions, with ``InvalidActionError``, a ``ValueError``."""
 
-_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_REASONING: Final = r"(?is:<{0}(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection)>|\[{0}think\])"
+"""The tags around a model's reasoning; with a slash for its end."""
 
-_OBJECT: Final = re.compile(r"""\{\s*(["'}]|\w+\s*:)""")
-"""The beginning of a JSON object, even if it is malformed."""
-
-_FENCE: Final = re.compile(r"^\s*```(?:[\w-]*\n)?(.*?)```\s*$", re.DOTALL)
-
-_TAG: Final = r"(?i:<{0}(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection)>|\[{0}think\])"
-"""Around a model's reasoning, with a slash at its end."""
-
-_NEGATION: Final = re.compile(
+_NEGATION: Final = (
     r"\b(?:not|never|no|nor|neither|cannot|without|avoid|against|except|instead of|rather than)\b"
     r"|n['\u2019]t\b"
 )
-
-_JOINED_TO: Final = re.compile(r"\w[-+.,/'\u2019]?$")
-_SIGN: Final = re.compile(r"([-+]\s*|\.)$")
-_JOINS: Final = re.compile(r"[-+.,/'\u2019]?\w")
-"""Between a label and another word or number: then the label is only a part of a word."""
 
 _ASCII: Final = {wide: wide - 0xFEE0 for wide in range(0xFF01, 0xFF5F)} | dict.fromkeys(
     (0x2010, 0x2011, 0x2012, 0x2212, 0xFE63), "-"
@@ -133,19 +121,19 @@ def _without_reasoning(text: str) -> str:
     Raises:
         ValueError: The reasoning never ends.
     """
-    begin = _TAG.format("")
-    end = _TAG.format("/")
-    text = re.sub(f"{begin}.*?{end}", " ", text, flags=re.DOTALL)
-    *_, text = re.split(end, text)
+    begin = _REASONING.format("")
+    end = _REASONING.format("/")
+    *_, text = re.split(end, re.sub(f"{begin}(?s:.*?){end}", " ", text))
     if re.search(begin, text):
         raise ValueError("the reasoning never ends")
-    return _FENCE.sub(r"\1", text)
+    return re.sub(r"(?s)^\s*```(?:[\w-]*\n)?(.*?)```\s*$", r"\1", text)
 
 
 def _objects(text: str) -> Iterator[JSON]:
     """Yield the JSON objects in a text; None for a malformed one."""
+    begin = re.compile(r"""\{\s*(["'}]|\w+\s*:)""")
     end = 0
-    while start := _OBJECT.search(text, end):
+    while start := begin.search(text, end):
         try:
             value, end = _DECODER.raw_decode(text, start.start())
         except json.JSONDecodeError as error:
@@ -209,7 +197,7 @@ def _label_in(text: str, labels: Labels) -> str:
             break
     text = fold(_plain(text))
     longest_first = sorted(filter(None, forms), key=len, reverse=True)
-    words = "|".join(re.escape(label).replace(r"\ ", r"\s+") for label in longest_first)
+    words = "|".join(map(re.escape, longest_first)).replace(r"\ ", r"\s+")
     pattern = rf"(?:(?<!\w)|(?!\w))(?:{words})(?:(?!\w)|(?<!\w))"
     said = set()
     end = 0
@@ -218,13 +206,13 @@ def _label_in(text: str, labels: Labels) -> str:
         if stop <= end:
             continue  # it is a part of a longer label
         end = stop
-        before = text[max(0, start - 9) : start]
-        is_negative = text[start].isdigit() and _SIGN.search(before)
-        if is_negative or _JOINED_TO.search(before) or _JOINS.match(text, stop):
+        around = f"{text[max(0, start - 9) : start]}\0{text[start]}\0{text[stop : stop + 2]}"
+        # It is joined to a word or a number, or a number with a sign.
+        if re.search(r"\w[-+.,/'\u2019]?\0.\0|\0.\0[-+.,/'\u2019]?\w|([-+]\s*|\.)\0\d", around):
             raise ValueError(f"{match[1]} is a part of a word")
         said.add(" ".join(match[1].split()))
     for clause in re.split(r"[.,;:!?\n]", re.sub(pattern, "\0", text)):
-        if "\0" in clause and _NEGATION.search(clause.casefold()):
+        if "\0" in clause and re.search(_NEGATION, clause.casefold()):
             raise ValueError("the label is denied")
     [form] = said
     return forms[form]
@@ -249,7 +237,7 @@ def _comparable(text: str) -> str | float:
 
 def _number(text: str) -> float:
     plain = _plain(text).strip("\"'`*")
-    if not _NUMBER.fullmatch(plain):
+    if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", plain):
         raise ValueError(f"{text} is no number")
     try:
         return int(plain)

@@ -75,7 +75,8 @@ def test_numbers_are_checked_against_their_bounds_here_as_well():
 
 
 def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parsed():
-    with endpoint([says("ajar"), says("Open")]) as (address, requests):
+    parts = [{"type": "text", "text": "Op"}, {"type": "thought"}, {"type": "text", "text": "en"}]
+    with endpoint([says("ajar"), says(parts)]) as (address, requests):
         assert played(model(address))[0] == played(lambda observation: 2)[0]
     answer, correction = requests[1]["messages"][-2:]
     assert answer == {"role": "assistant", "content": "ajar"}
@@ -135,56 +136,36 @@ def test_an_endpoint_without_structured_output_is_asked_without(status, problem)
     assert "schema" not in json.dumps(requests[-1])
 
 
-def test_another_error_leaves_structured_output_as_it_is():
-    with endpoint([fails(404, "no such model")]) as (address, _):
-        policy = model(address)
-        assert played(FallbackPolicy(policy)) == played(RULE)
-    assert policy.structured
-
-
-def test_parts_of_a_content_are_joined():
-    parts = [
-        {"type": "reasoning", "text": "closed?"},
-        *({"type": "text", "text": part} for part in ("op", "en")),
-    ]
-    with endpoint([says(parts)]) as (address, _):
-        assert played(model(address)) == played(lambda observation: 2)
-
-
-def test_a_late_endpoint_is_counted_as_late():
-    with endpoint([0.5]) as (address, _):
-        guarded = FallbackPolicy(model(address, timeout=0.1, retries=0))
-        assert played(guarded) == played(RULE)
-    assert guarded.counts["late"] == 5
+@pytest.mark.parametrize(("answer", "kind"), [(fails(404, "no such model"), "http"), (0.5, "late")])
+def test_another_error_leaves_structured_output_as_it_is(answer, kind):
+    with endpoint([answer]) as (address, _):
+        policy = FallbackPolicy(model(address, timeout=0.1, retries=0))
+        assert played(policy) == played(RULE)
+    assert policy.policy.structured
+    assert policy.counts[kind] == 5
 
 
 @pytest.mark.parametrize("wrap", [lambda make: None, lambda make: make(), lambda make: make])
 def test_each_process_has_its_own_connection(wrap):
+    async def closing(observation):
+        await policy._client_here().close()
+        return 2
+
     with endpoint([OPEN]) as (address, requests):
-        options = {"base_url": address, "api_key": "a key"}
-        client = wrap(partial(openai.AsyncOpenAI, **options))
-        policy = LanguageModelPolicy("fake", client=client, **options)
-        found = played(policy)
+        make = partial(openai.AsyncOpenAI, base_url=address, api_key="a key")
+        policy = model(address, client=wrap(make))
         process = get_context("fork").Process(target=played, args=(policy,))
+        assert played(policy) == played(policy)
         process.start()
-        assert played(policy) == found
         process.join()
-        assert process.exitcode == 0
-        assert played(policy) == found
-        if isinstance(client, openai.AsyncOpenAI):
-
-            async def closing(observation):
-                await client.close()
-                return 0
-
-            played(closing)
+        assert played(policy) == played(closing)
+    assert process.exitcode == 0
     ports = Counter(request["port"] for request in requests)
     assert sorted(ports.values()) == [5, 15]
 
 
 def test_a_client_that_cannot_be_copied_is_refused_elsewhere():
-    client = SimpleNamespace(chat=SimpleNamespace(), lock=Lock())
-    policy = LanguageModelPolicy("own", client=client)
+    policy = LanguageModelPolicy("own", client=SimpleNamespace(chat=Lock()))
     with pytest.raises(LanguageModelError, match="client= be a function that makes it"):
         played(copy.copy(policy))
 

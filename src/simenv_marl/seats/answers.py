@@ -7,7 +7,7 @@ searched as text. If a text can mean two actions, it names none.
 import json
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final
@@ -166,18 +166,13 @@ def _at_action(value: JSON) -> list[JSON]:
 def _labelled(labels: Mapping[int, str], value: JSON) -> int:
     """Return the action of a ``Discrete`` that a value names, by its label or by its number."""
     text = value if isinstance(value, str) else json.dumps(value)
-    for action, label in labels.items():
-        if label == text:
-            return action
     sought = _comparable(text)
     forms = {action: _comparable(label) for action, label in labels.items()}
-    alike = [action for action, form in forms.items() if form == sought != ""]
-    if not alike:
-        number = _whole_number(text)
-        other = [action for action, form in forms.items() if form not in (action, str(form))]
-        if number not in labels or other:  # a label that is another number
-            raise ValueError(f"{text} is no label")
-        return number
+    alike = [action for action, label in labels.items() if label == text]
+    if not alike and sought != "":
+        alike = [action for action, form in forms.items() if form == sought]
+    if not alike and all(form in (action, str(form)) for action, form in forms.items()):
+        alike = [action for action in labels if action == sought]  # no label is another number
     [action] = alike
     return action
 
@@ -190,12 +185,10 @@ def _label_in(text: str, labels: Labels) -> str:
     """
     if not isinstance(labels, Mapping):
         raise ValueError("there are no labels")
-    fold: Callable[[str], str]
-    for fold in (str.casefold, str):  # labels may differ in case alone
-        forms = {fold(_plain(label)): label for label in labels.values()}
-        if len(forms) == len(labels):
-            break
-    text = fold(_plain(text))
+    forms = {_plain(label).casefold(): label for label in labels.values()}
+    if len(forms) < len(labels):
+        raise ValueError("labels differ in case alone")
+    text = _plain(text).casefold()
     longest_first = sorted(filter(None, forms), key=len, reverse=True)
     words = "|".join(map(re.escape, longest_first)).replace(r"\ ", r"\s+")
     pattern = rf"(?:(?<!\w)|(?!\w))(?:{words})(?:(?!\w)|(?<!\w))"
@@ -212,7 +205,7 @@ def _label_in(text: str, labels: Labels) -> str:
             raise ValueError(f"{match[1]} is a part of a word")
         said.add(" ".join(match[1].split()))
     for clause in re.split(r"[.,;:!?\n]", re.sub(pattern, "\0", text)):
-        if "\0" in clause and re.search(_NEGATION, clause.casefold()):
+        if "\0" in clause and re.search(_NEGATION, clause):
             raise ValueError("the label is denied")
     [form] = said
     return forms[form]
@@ -239,10 +232,7 @@ def _number(text: str) -> float:
     plain = _plain(text).strip("\"'`*")
     if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", plain):
         raise ValueError(f"{text} is no number")
-    try:
-        return int(plain)
-    except ValueError:
-        return float(plain)
+    return float(plain)
 
 
 # -- values ---------------------------------------------------------------------------------------
@@ -267,7 +257,7 @@ def to_action(
         case Discrete():
             return _labelled(labels, value) if isinstance(labels, Mapping) else _whole_number(value)
         case Text():
-            return _text(space, value)
+            return value if space.contains(value) else str.strip(value)
         case Dict():
             values = dict(value)
             action = {}
@@ -309,14 +299,6 @@ def _to_array(space: Space[Any], value: Action) -> NDArray[Any]:
     if array.dtype.kind in "iu" and not np.array_equal(array, numbers):
         raise ValueError("the components are no integers of this size")
     return array
-
-
-def _text(space: Text, value: Action) -> str:
-    """Return the text that a value is, without blanks around it if they are not legal."""
-    if not isinstance(value, (str, int, float)):
-        raise TypeError("the value is no text")
-    text = value if isinstance(value, str) else json.dumps(value)
-    return text if space.contains(text) else text.strip()
 
 
 def _whole_number(value: str | float) -> int:

@@ -8,7 +8,7 @@ from copy import deepcopy
 from inspect import cleandoc
 from itertools import chain
 from time import perf_counter
-from typing import Any, Final
+from typing import Any
 from uuid import uuid4
 from weakref import finalize
 
@@ -27,9 +27,6 @@ from . import descriptions
 from .answers import parse
 from .descriptions import Schema, action_schema, at_decision
 from .policies import kind_of
-
-TEXT_TYPES: Final = (None, "text", "output_text")
-"""The types of the parts of a content that are the answer."""
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""
@@ -233,19 +230,16 @@ class LanguageModelPolicy:
         """Return the client of this process."""
         process = os.getpid()
         if process not in self._clients:
-            client = self._new_client()
+            client = self._client
+            if client is None:
+                openai = import_extra("openai", "LanguageModelPolicy")
+                client = openai.AsyncOpenAI(**self._client_options)
+            else:
+                client = _copied(client) if hasattr(client, "chat") else client()
             self._clients[process] = client
-            if hasattr(client, "close"):
-                finalizer = finalize(self, _close, client, process)
-                finalizer.atexit = False
+            finalizer = finalize(self, _close, client, process)
+            finalizer.atexit = False
         return self._clients[process]
-
-    def _new_client(self) -> Any:
-        client = self._client
-        if client is None:
-            openai = import_extra("openai", "LanguageModelPolicy")
-            return openai.AsyncOpenAI(**self._client_options)
-        return _copied(client) if hasattr(client, "chat") else client()
 
 
 class _NoAnswerError(LanguageModelError):
@@ -275,7 +269,7 @@ def _content(response: Any, model: str) -> str:
     if isinstance(content, list):
         parts = [part if isinstance(part, dict) else vars(part) for part in content]
         refusal = refusal or "".join(part.get("refusal", "") for part in parts)
-        content = "".join(part.get("text", "") for part in parts if part.get("type") in TEXT_TYPES)
+        content = "".join(part["text"] for part in parts if part.get("type") == "text")
     kind = "failed"
     if message is None:
         problem = f"the endpoint returned {short_repr(response)}"
@@ -321,5 +315,5 @@ def _copied(client: Any) -> Any:
 
 def _close(client: Any, process: int) -> None:
     """Close the connections of a client in the policies' thread, without waiting for it."""
-    if os.getpid() == process:  # not in a fork, which has no part in the connections
+    if os.getpid() == process and hasattr(client, "close"):  # not in a fork
         Answer(client.close(), lambda answer: None)

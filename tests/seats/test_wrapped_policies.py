@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -19,9 +20,8 @@ from .tank import FILL, POINTS, Tank, experiment, filling, levels, played
 
 
 def counted(**numbers):
-    return (
-        dict.fromkeys(("asked", "retried", "late", "failed", "illegal", "fallbacks"), 0) | numbers
-    )
+    kinds = ("asked", "retried", "late", "refused", "http", "failed", "illegal", "fallbacks")
+    return dict.fromkeys(kinds, 0) | numbers
 
 
 def raises(observation):
@@ -40,6 +40,32 @@ def late(observation):
 
 async def never(observation):
     await asyncio.sleep(600)
+
+
+async def stubborn(observation):
+    for _ in range(9):
+        with suppress(asyncio.CancelledError):
+            await asyncio.sleep(0.1)
+
+
+async def cancelled(observation):
+    raise asyncio.CancelledError
+
+
+def cancelled_at_once(observation):
+    raise asyncio.CancelledError
+
+
+async def exits(observation):
+    raise SystemExit
+
+
+class BusyError(Exception):
+    status_code = 503
+
+
+def busy(observation):
+    raise BusyError
 
 
 def illegal(observation):
@@ -61,6 +87,7 @@ def two(observation):
 @pytest.mark.parametrize("retries", [0, 2])
 @pytest.mark.parametrize(("policy", "kind"), [
     (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"),
+    (stubborn, "late"), (cancelled, "failed"), (cancelled_at_once, "failed"), (busy, "http"),
     (illegal, "illegal"), (illegal_later, "illegal"),
 ])  # fmt: skip
 def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
@@ -70,6 +97,12 @@ def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, ret
     tries = Tank.days * (1 + retries)
     assert guarded.counts == counted(asked=5, fallbacks=5, retried=tries - 5, **{kind: tries})
     assert guarded.last_error is not None
+
+
+def test_an_exit_of_a_coroutine_ends_the_simulation_and_not_the_event_loop():
+    with pytest.raises(SystemExit):
+        played(FallbackPolicy(exits))
+    assert played(FallbackPolicy(illegal_later)) == played(RULE)
 
 
 def test_an_answer_after_a_retry_is_used():

@@ -13,19 +13,36 @@ from uuid import uuid4
 
 import numpy as np
 
-from ..core import COUNTS, Caller, Decision, Info, PolicyWrapper, count, waits, when_answered
+from ..core import (
+    COUNTS,
+    Caller,
+    Decision,
+    Info,
+    PolicyWrapper,
+    count,
+    split_extras,
+    waits,
+    when_answered,
+)
 from ..errors import (
     InvalidActionError,
+    LanguageModelError,
     OptionValueError,
     describe_error,
     short_repr,
     warn_user,
 )
 from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
-from .descriptions import to_action
+from .answers import to_action
 
-KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
+KINDS: Final = (*("asked", "retried", "late", "refused", "http", "failed", "illegal", "fallbacks"),)
 """The events that a ``FallbackPolicy`` counts."""
+
+Outcome = tuple[Action, BaseException | None]
+"""An answer, or an error."""
+
+LEFT: Final[set[asyncio.Future[Outcome]]] = set()
+"""The late answers that have not ended yet. An event loop does not keep its tasks alive."""
 
 Policy = Callable[..., Action | Awaitable[Action]]
 """A policy, as ``simulate`` takes them. It may be a coroutine function."""
@@ -57,8 +74,9 @@ class FallbackPolicy(PolicyWrapper):
         Args:
             policy: The policy, as ``simulate`` takes them. It may be a coroutine function.
             fallback: ``RULE``, or the policy that answers instead.
-            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then;
-                the time of other functions is measured afterwards. None: there is no limit.
+            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then,
+                and left behind if it does not end; the time of other functions is measured
+                afterwards. None: there is no limit.
             retries: How often the policy is asked again before the fallback answers.
 
         Raises:
@@ -79,7 +97,8 @@ class FallbackPolicy(PolicyWrapper):
     def counts(self) -> dict[str, int]:
         """The numbers of decisions, retries, faults and fallbacks.
 
-        The keys are ``asked`` (decisions), ``retried``, ``late``, ``failed``, ``illegal`` and
+        The keys are ``asked`` (decisions), ``retried``, ``late``, ``refused`` (by a language
+        model), ``http`` (errors of an endpoint), ``failed`` (other errors), ``illegal`` and
         ``fallbacks``. ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes``
         add the counts of their workers.
         """
@@ -109,17 +128,15 @@ class FallbackPolicy(PolicyWrapper):
                 self._count(decision, "retried")
             try:
                 answer = await self._ask_in_time(*arguments)
-                if answer is not RULE:
-                    decision.validate(answer)
+                action, _ = split_extras(answer, decision.action_space)
+                if action is not RULE:
+                    decision.validate(action)
                 return answer
             except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
-            except TimeoutError as error:
-                self._note(decision, "late", error)
-            except InvalidActionError as error:
-                self._note(decision, "illegal", error)
             except Exception as error:
-                self._note(decision, "failed", error)
+                self.last_error = describe_error(error)
+                self._count(decision, kind_of(error))
         self._count(decision, "fallbacks")
         answer = self._ask_fallback(*arguments)
         if isawaitable(answer):
@@ -131,28 +148,69 @@ class FallbackPolicy(PolicyWrapper):
         problem = f"the answer took longer than {self.timeout} s"
         start = monotonic()
         try:
-            answer = self.ask(*arguments)
+            try:
+                answer = self.ask(*arguments)
+            except asyncio.CancelledError as error:
+                raise RuntimeError("the policy has cancelled itself") from error
             if isawaitable(answer) and self.waits:
-                answer = await asyncio.wait_for(answer, self.timeout)
+                answer = await _within(self.timeout, answer)
         except TimeoutError as error:
             raise TimeoutError(str(error) or problem) from error
         if self.timeout is not None and monotonic() - start > self.timeout:
             raise TimeoutError(problem)
         return answer
 
-    def _note(
-        self,
-        decision: Decision,
-        kind: str,
-        error: Exception,
-    ) -> None:
-        self.last_error = describe_error(error)
-        self._count(decision, kind)
-
     def _count(self, decision: Decision, kind: str) -> None:
         if not decision.in_clone:
             count(self._token, **{kind: 1})
             decision.count(**{kind: 1})
+
+
+async def _within(timeout: float | None, answer: Awaitable[Action]) -> Action:
+    """Await an answer for some seconds. Then cancel it, without waiting for its end.
+
+    Raises:
+        TimeoutError: The time is up.
+        RuntimeError: The answer has cancelled itself.
+    """
+    task = asyncio.ensure_future(_outcome(answer))
+    try:
+        await asyncio.wait({task}, timeout=timeout)
+    except asyncio.CancelledError:  # of the decision, not of the answer
+        task.cancel()
+        await asyncio.wait({task})
+        raise
+    if not task.done():
+        LEFT.add(task)
+        task.add_done_callback(LEFT.discard)
+        task.cancel()
+        raise TimeoutError
+    value, error = task.result()
+    if isinstance(error, asyncio.CancelledError):
+        raise RuntimeError("the policy has cancelled itself") from error
+    if error is not None:
+        raise error
+    return value
+
+
+async def _outcome(answer: Awaitable[Action]) -> Outcome:
+    try:
+        return await answer, None
+    except BaseException as error:  # also an exit, because it would end the event loop
+        return None, error
+
+
+def kind_of(error: Exception) -> str:
+    """Return the count to which an error of a policy adds."""
+    match error:
+        case InvalidActionError():
+            return "illegal"
+        case LanguageModelError():
+            return error.kind
+    if hasattr(error, "status_code"):
+        return "http"
+    is_late = isinstance(error, TimeoutError) or "Timeout" in type(error).__name__
+    return "late" if is_late else "failed"
 
 
 def _leave_to_rule(observation: Observation) -> Action:
@@ -267,8 +325,9 @@ class RecordedPolicy(PolicyWrapper):
         answer: Action,
         decision: Decision,
     ) -> Action:
-        """Record an answer, unless it is illegal, and return it."""
+        """Record an answer, unless it is illegal, and return it without extras."""
         recorded = None
+        answer, _ = split_extras(answer, decision.action_space)
         if answer is not RULE:
             try:
                 action = decision.validate(answer)

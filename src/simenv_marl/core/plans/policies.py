@@ -16,10 +16,12 @@ from functools import partial
 from time import perf_counter
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
+from gymnasium.spaces import Tuple
+
 from ...errors import OptionValueError, short_repr
 from ...simulation import RULE, Action, Observation, asks_for, positional
 from ..switching.awaiting import wait_for
-from .point import Policy
+from .point import Policy, Space
 
 Info: TypeAlias = dict[str, Any]
 Result = TypeVar("Result")
@@ -201,6 +203,18 @@ def when_answered(
         return conclude(await answer)
 
     return wait()
+
+
+def split_extras(answer: Action, space: Space | None = None) -> tuple[Action, Mapping[str, Any]]:
+    """Split the result of a policy into the action, or the actions, and the extras.
+
+    ``space``: the space of one action, because an action of a ``Tuple`` may look like both.
+    """
+    is_pair = type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping)
+    if is_pair and not (isinstance(space, Tuple) and space.contains(answer)):
+        action, extras = answer
+        return action, extras
+    return answer, {}
 
 
 class PolicyWrapper:

@@ -17,7 +17,8 @@ from ...core import Decision, Labels, Mask
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action, Observation
-from ..descriptions import JSON, MISFITS, labelled, legal_actions, to_action
+from ..answers import MISFITS, to_action
+from ..descriptions import JSON, labelled, legal_actions
 from ..policies import digest_of
 
 Message = dict[str, Any]

@@ -2,21 +2,18 @@
 
 import asyncio
 import copy
-import json
 import os
 import pickle
 import time
 from contextlib import suppress
 
-import numpy as np
 import pytest
-from gymnasium import spaces
 
 from simenv_marl import RULE, branch, clone, evaluate, single_env
 from simenv_marl.errors import DefinitionError, InvalidActionError, OptionValueError
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 
-from .tank import FILL, POINTS, Tank, experiment, filling, levels, played
+from .tank import FILL, POINTS, Tank, experiment, levels, played
 
 
 def counted(**numbers):
@@ -276,94 +273,3 @@ def test_copies_and_pickles_count_together():
     played(copy.deepcopy(guarded))
     played(pickle.loads(pickle.dumps(guarded)))
     assert guarded.counts == counted(asked=10, failed=10, fallbacks=10)
-
-
-# -- recordings -----------------------------------------------------------------------------------
-
-
-class Asked:
-    """A policy that counts how often it is asked."""
-
-    def __init__(self):
-        self.times = 0
-
-    def __call__(self, observation, *, _decision):
-        self.times += 1
-        return RULE if _decision.number == 2 else int(observation[0] * 1000) % 3
-
-
-class Waiting(Asked):
-    async def __call__(self, observation, *, _decision):
-        await asyncio.sleep(0)
-        return super().__call__(observation, _decision=_decision)
-
-
-@pytest.mark.parametrize("kind", [Asked, Waiting])
-def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
-    first, path = kind(), tmp_path / "answers.jsonl"
-    recorded = levels(RecordedPolicy(first, path), range(4))
-    assert first.times == 20
-    assert len(path.read_text().splitlines()) == 20
-    entry = json.loads(path.read_text().splitlines()[0])
-    assert entry.keys() == {"seed", "agent", "number", "observation", "answer"}
-    assert entry["agent"] == "filler"
-    second = kind()
-    assert (
-        levels(RecordedPolicy(second, path), range(5))[:4] == recorded == levels(kind(), range(4))
-    )
-    assert second.times == 5  # those of the new seed
-
-
-def test_a_recording_is_used_after_a_crash_but_not_for_other_observations(tmp_path):
-    path = tmp_path / "answers.jsonl"
-
-    def asked_again():
-        policy = Asked()
-        assert played(RecordedPolicy(policy, path)) == played(Asked())
-        return policy.times
-
-    assert asked_again() == 5
-    whole = path.read_text()
-    path.write_text(whole[:-9])  # the last line was not finished
-    assert asked_again() == 1
-    with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
-        assert asked_again() == 0
-    path.write_text(whole.replace(json.loads(whole.splitlines()[0])["observation"], "other"))
-    assert asked_again() == 1
-
-
-def test_illegal_answers_are_not_recorded(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    guarded = FallbackPolicy(RecordedPolicy(illegal, path))
-    assert played(guarded) == played(RULE)
-    assert not path.exists()
-    assert guarded.counts["illegal"] == 5
-
-
-PARTS = {
-    "box": (spaces.Box(-1, 1, (2,), np.float32), np.array([0.1, -0.7], np.float32)),
-    "scalar": (spaces.Box(0, 1, (1,), np.float64), 0.1 + 0.2),
-    "nested": (
-        spaces.Dict(
-            {
-                "a": spaces.Discrete(3),
-                "b": spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.MultiBinary(2)]),
-            }
-        ),
-        {"a": 2, "b": (0.25, np.array([1, 0], np.int8))},
-    ),
-    "many": (spaces.MultiDiscrete([3, 4]), np.array([2, 3])),
-}
-
-
-@pytest.mark.parametrize("kind", PARTS)
-def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
-    space, action = PARTS[kind]
-    seen = []
-    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
-    for policy in (lambda observation: action, raises):
-        played(RecordedPolicy(policy, tmp_path / "answers"), points=points)
-    assert len(seen) == 10
-    for given, repeated in zip(seen[:5], seen[5:], strict=True):
-        assert space.contains(repeated)
-        np.testing.assert_equal(repeated, given)

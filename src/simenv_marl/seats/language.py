@@ -27,6 +27,7 @@ from . import descriptions
 from .answers import parse
 from .descriptions import Schema, action_schema, at_decision
 from .policies import kind_of
+from .recordings import digest_of
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""
@@ -132,6 +133,11 @@ class LanguageModelPolicy:
 
     def _prompt(self, decision: Decision) -> str:
         return f"{self._system_text(decision, self.structured)}\n\n{self._describe(decision)}"
+
+    def identify(self, decision: Decision) -> dict[str, str]:
+        """Return the name of the model and a digest of the prompt, for recordings."""
+        prompt = (self._system_text(decision, True), self._describe(decision))
+        return {"model": self.model, "prompt": digest_of(prompt)}
 
     async def __call__(
         self, observation: Observation, info: object = None, *, _decision: Decision

@@ -19,7 +19,7 @@ from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action, Observation
 from ..answers import MISFITS, to_action
 from ..descriptions import JSON, labelled, legal_actions
-from ..policies import digest_of
+from ..recordings import digest_of
 
 Message = dict[str, Any]
 """A message between the page, the server and the game, or a part of one."""

@@ -485,7 +485,7 @@ class Episode(EpisodeState):
                 continue
             if not agent.arguments.is_empty:
                 self.latest = agent
-            agent.refresh(reward=in_rounds)
+            agent.refresh(reward=in_rounds, asked=agent is pending)
             if in_rounds and self.skips and agent.present:
                 agent.carry_reward(not self.turns)
             if agent.choices is not None and agent is not pending:

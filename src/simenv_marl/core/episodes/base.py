@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 
 from ...errors import (
     AgentError,
+    ObservationError,
     OptionValueError,
     SimEnvError,
     ViewError,
@@ -279,10 +280,18 @@ class StateReader:
         Raises:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: There is no episode to observe.
+            ObservationError: The state is no array, or does not fit its space.
             AgentError: An agent that policies answer was not declared.
         """
         if self._roster is None:
-            return self._cast(session.ask("state"))
+            state = session.ask("state")
+            try:
+                return self._cast(state)
+            except ValueError as error:
+                problem = str(error).replace("the observation", "the state")
+                raise ObservationError(
+                    f"state() has returned an illegal value: {problem}"
+                ) from None
         episode = session.episode
         if episode is None:
             raise session.refusal()

@@ -5,14 +5,9 @@ from __future__ import annotations
 import copy
 import pickle
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import (
-    Any,
-    Self,
-    TypeAlias,
-    TypeVar,
-)
+from typing import Any, Self, TypeAlias, TypeVar
 from zlib import crc32
 
 import gymnasium as gym
@@ -60,11 +55,11 @@ StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
 _OWN_OPTIONS = {
-    "agent": "the single view",
-    "flatten": "joint and turn views",
-    "state_in_info": "joint and turn views",
+    "agent": "the single view only; elsewhere, policies={name: RULE} leaves an agent to its rule",
+    "flatten": "joint and turn views only",
+    "state_in_info": "joint and turn views only",
 }
-"""The options that not every view takes."""
+"""The options that not every view takes, and the views that take them."""
 
 _NOT_COPIED = frozenset(
     ("_finalizer", "_lock", "_roster", "joint", "own_agent", "own_seat", "session", "turn")
@@ -147,9 +142,7 @@ class View:
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
-        for option, views in _OWN_OPTIONS.items():
-            if getattr(plan.options, option) and option not in cls._own_options:
-                raise UnknownOptionError(f"{option} is an option of {views} only")
+        cls.check_options(vars(plan.options))
         for point in plan.active:
             first = plan.roster.get(point.agent or "", point)
             if not plan.can_share(point, first):
@@ -158,6 +151,13 @@ class View:
                     " but their spaces differ; name the agents differently, or use turn_env"
                 )
         return plan
+
+    @classmethod
+    def check_options(cls, options: Mapping[str, Any]) -> None:
+        """Refuse options that this view does not take."""
+        for option, views in _OWN_OPTIONS.items():
+            if options.get(option) and option not in cls._own_options:
+                raise UnknownOptionError(f"{option} is an option of {views}")
 
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from math import exp
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -26,10 +27,12 @@ from ..core import (
     common_observations,
 )
 from ..decision import DecisionPoint
-from ..errors import ViewError, short_repr
+from ..errors import ViewError, listed, short_repr
 from ..simulation import RULE
 from .agents import refuse_unknown_agents
 from .base import OneAgentView, StepResult
+
+United = TypeVar("United")
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""
@@ -74,9 +77,12 @@ class Turn:
         """Unite the spaces of the active points, or raise ``ViewError`` if that is not possible."""
         options = plan.options
         definitions = [point.definition for point in plan.active]
-        common, encoders = common_observations([each.observation_space for each in definitions])
+        names = [point.hook.name for point in plan.active]
+        seen = [each.observation_space for each in definitions]
+        common, encoders = _united(common_observations, seen, names)
         actions = [each.action_space for each in definitions]
-        self.action_space, codes = common_actions(actions, clips=options.clip_actions)
+        unite = partial(common_actions, clips=options.clip_actions)
+        self.action_space, codes = _united(unite, actions, names)
         self.translates = any(space != self.action_space for space in actions)
         hooks = [point.hook for point in plan.active]
         kinds = map(np.int64, range(len(hooks)))
@@ -102,7 +108,7 @@ class Turn:
             if not isinstance(self.observation_space, spaces.Box):
                 raise ViewError(
                     "flatten=True needs observation spaces that can be flattened, not"
-                    f" {short_repr(common)}"
+                    f" {short_repr(common)} of {listed(names)}"
                 )
 
     def observe(self, agent: Agent) -> Observation:
@@ -140,6 +146,23 @@ class Turn:
             ]
             self._beginnings[key] = np.concatenate(parts).astype(self.observation_space.dtype)
         return self._beginnings[key]
+
+
+def _united(unite: Callable[[list[Space]], United], parts: list[Space], names: list[str]) -> United:
+    """Unite the spaces of decision points. In an error, name the points that prevent it."""
+    try:
+        return unite(parts)
+    except ViewError as error:
+        guilty = []
+        for part, name in zip(parts, names, strict=True):
+            try:
+                unite([part, spaces.Box(0, 1, (1,))])
+            except ViewError:
+                guilty.append(name)
+        raise ViewError(
+            f"{error}; it is the space of {listed(guilty)}, which needs another one, or an answer"
+            " by policies="
+        ) from None
 
 
 class SimulationTurnEnv(OneAgentView):

@@ -7,7 +7,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TransformAction, TransformReward
 
-from simenv_marl import RULE, branch, clone, turn_env
+from simenv_marl import RULE, branch, clone, generate_env, joint_env, simulate, turn_env
+from simenv_marl.data import joint_policy, turn_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, UnknownAgentError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
 from tests.planning.test_action_values import METHODS, begun, futures_of
@@ -103,6 +104,52 @@ def test_a_base_by_agent_sees_and_acts_as_the_agents_do(method):
     env = begun(TransformAction(made(), lambda action: action, spaces.Discrete(2)))
     with pytest.raises(OptionValueError, match="no wrapper has replaced"):
         action_values(env, base=bases)
+
+
+def paced(seen):
+    return int(seen[0]) % 3
+
+
+@pytest.mark.parametrize("view", ["turn", "aec", "parallel", "joint", "flat"])
+def test_a_base_for_all_agents_decides_as_bases_by_agent_do(view):
+    def together(seen, info):
+        parts = seen.values() if isinstance(seen, dict) else np.split(seen, 2)
+        answers = dict(zip(("left", "right"), map(paced, parts), strict=True))
+        return answers if isinstance(seen, dict) else (np.array(list(answers.values())), {})
+
+    kind = generate_env(Duel, points(), view="joint" if view == "flat" else view)
+    env = begun(kind(flatten=view == "flat"))
+    joint = joint_env(Duel, points(), flatten=view == "flat")
+    actions = {"joint": [{"left": 2, "right": 0}], "flat": [np.array([2, 0])]}.get(view, [0, 2])
+    bases = [
+        joint_policy(together, like=joint),
+        dict.fromkeys(("left", "right"), paced),
+        turn_policy(lambda seen: paced(seen["observation"]), like=made()),
+    ]
+    told = action_values(env, actions, base=bases[0], futures=2).returns
+    if view == "flat":
+        env = begun(joint_env(Duel, points()))
+        actions = [{"left": 2, "right": 0}]
+    for base in bases[1:]:
+        expected = action_values(env, actions, base=base, futures=2).returns
+        assert told == pytest.approx(expected)
+
+
+def test_policies_that_plan_take_bases_for_all_agents():
+    turn = turn_policy(lambda seen: paced(seen["observation"]), like=made())
+    values = []
+    for base in (dict.fromkeys(("left", "right"), paced), turn, turn | {"right": RULE}):
+
+        def plan(seen, *, _environment, base=base):
+            values.append(action_values(_environment, [0, 2], base=base, futures=2).means.tolist())
+            return RULE
+
+        simulate(Duel, {"left": plan}, points=points(), seed=5)
+    by_agent, by_all, by_some = np.reshape(values, (3, -1))
+    assert by_all == pytest.approx(by_agent)
+    assert by_some != pytest.approx(by_agent)
+    tree = TreeSearchPolicy([0, 2], base=turn, futures=4)
+    assert tree.choose(made()).means.all()
 
 
 @ONE_FUTURE

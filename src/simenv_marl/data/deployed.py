@@ -182,11 +182,11 @@ class JointPolicy(_Deployed):
 
     def __init__(self, predict: Predict, plan: Plan) -> None:
         super().__init__(predict, plan)
-        self._joint: Joint = plan.derive(Joint)
+        self.joint: Joint = plan.derive(Joint)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the agent's action of the round. Begin another without one."""
-        if agent.name not in self._joint.roster:
+        if agent.name not in self.joint.roster:
             raise UnknownAgentError(
                 f"{agent.name!r} is no agent of the joint view in which the policy was trained"
             )
@@ -199,15 +199,21 @@ class JointPolicy(_Deployed):
 
     def _begin_round(self, episode: Episode, deciding: Agent) -> dict[str, Action]:
         """Ask for the actions of all live agents, and return them."""
+        answer = self.answer_all(episode, deciding)
+        found = {name: episode.find(name) for name in self.joint.roster}
+        live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
+        actions = self.joint.actions(live, answer)
+        episode.memory[self] = actions
+        return actions
+
+    def answer_all(self, episode: Episode, deciding: Agent) -> Action:
+        """Answer with the joint action. ``deciding``: the agent whose decision is pending."""
         episode.observe_others(deciding)
-        found = {name: episode.find(name) for name in self._joint.roster}
-        seen, told = self._joint.see(list(found.values()))
+        found = {name: episode.find(name) for name in self.joint.roster}
+        seen, told = self.joint.see(list(found.values()))
         unused = episode.memory.get(self, found)
         told["deciding"] = deciding.name
         told["acted"] = {name: name not in unused for name in found}
         state = episode.read_state() if self.takes_state else None
-        answer, _ = self._ask(seen, told, self._joint.action_space, state)
-        live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
-        actions = self._joint.actions(live, answer)
-        episode.memory[self] = actions
-        return actions
+        answer, _ = self._ask(seen, told, self.joint.action_space, state)
+        return answer

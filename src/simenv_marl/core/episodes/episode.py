@@ -37,7 +37,7 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
+from ...simulation import EVERYONE, RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
     AskingPolicy,
@@ -580,15 +580,15 @@ class Episode(EpisodeState):
 
     def delegate(self, policies: Mapping[str, Policy]) -> None:
         """In a branch, let policies answer for the agents that follow the rule."""
-        substitutes: dict[str, Policy] = {}
+        substitutes: dict[Any, Policy] = {}
         for name in policies.keys() - self.agents.keys():
             policy = policy_for(policies, name, self.where)
-            if policy is not RULE:
-                substitutes[name] = two_arguments(policy)
+            substitutes[name] = policy if policy is RULE else two_arguments(policy)
         self.plan = self.plan.with_policies(substitutes)
         for name, agent in self.others.items():
-            if name in substitutes and agent.policy is RULE:
-                agent.delegate(substitutes[name])
+            substitute = substitutes.get(name, substitutes.get(EVERYONE, RULE))
+            if agent.policy is RULE and substitute is not RULE:
+                agent.delegate(substitute)
 
     # -- ends -------------------------------------------------------------------------------------
 

@@ -326,9 +326,10 @@ class Plan:
         subject = replace(self.subject, mode=Mode.SIMULATE)
         return replace(self, subject=subject, one_agent=agent, named_agents=frozenset())
 
-    def with_policies(self, policies: Mapping[str, Policy]) -> Plan:
+    def with_policies(self, policies: Mapping[Any, Policy]) -> Plan:
         """Return the plan of a branch in which policies answer for agents that have none."""
-        return replace(self, policies={**policies, **self.policies})
+        everyone = policies.get(EVERYONE, self.everyone)
+        return replace(self, policies={**policies, **self.policies}, everyone=everyone)
 
     def __deepcopy__(self, memory: object) -> Plan:
         return self  # because nothing changes it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import aec_env, clone, parallel_env, simulate, single_env, turn_env
+from simenv_marl import RULE, aec_env, clone, parallel_env, simulate, single_env, turn_env
 from simenv_marl.errors import AgentError, NoDecisionError
 from tests.worlds.models import calling, decision, define, play, script
 
@@ -122,6 +122,22 @@ def test_different_spaces_need_the_turn_view():
         ended = terminated or truncated
     assert turn.simulation.log == EXPECTED
     assert total == 10.0
+
+
+def test_the_state_has_one_part_for_an_agent_with_two_kinds_of_observations():
+    make = points(observation_space=spaces.Discrete(3), observation_space_mapping=lambda nurse: 2)
+    names = {point: ["ann", "bob"] for point in make}
+    given = {"possible_agents": names, "state_space": "observations", "state_in_info": True}
+    env = turn_env(Ward, make, **given)
+    _, info = env.reset()
+    states = [info["state"].tolist(), *(env.step(RULE)[-1]["state"].tolist() for _ in range(3))]
+    assert env.state_space.shape == (6,)
+    assert states == [
+        [0, 0, 0, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 1],
+    ]
 
 
 # -- births ---------------------------------------------------------------------------------------

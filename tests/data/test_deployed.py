@@ -188,6 +188,7 @@ def test_beside_one_agent_a_turn_policy_answers_all_others():
         observation, _, terminated, truncated, info = single.step(action)
         ended = terminated or truncated
     assert single.simulation.trace == expected
+    assert [*single.provenance()["policies"].values()] == ["<TurnPolicy: predict>"]
     with pytest.raises(OptionValueError, match="agent="):
         turn_env(Bakery, POINTS, policies=policies)
 

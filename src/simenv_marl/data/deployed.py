@@ -26,7 +26,7 @@ from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..envs.base import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
-from ..errors import OptionValueError, UnknownAgentError, short_repr
+from ..errors import OptionValueError, UnknownAgentError, name_of, short_repr
 from ..many.batch import read_answers
 from ..simulation import EVERYONE, RULE
 
@@ -110,6 +110,9 @@ class _Deployed(EpisodePolicy):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.policy, self._plan)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {name_of(self.policy)}>"  # also in provenance
 
     def _ask(
         self, observation: Observation, info: Info, space: Any, state: object

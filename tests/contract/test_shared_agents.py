@@ -80,6 +80,25 @@ def test_an_entity_with_two_kinds_of_decisions_is_one_agent():
     assert sum(turn.reward for turn in turns if turn.agent == "bob") == 6.0
 
 
+class Announcing(Ward):
+    """Announces both decisions of all nurses."""
+
+    def expected_calls(self, point: str) -> list[tuple[Nurse]]:
+        return [(nurse,) for nurse in self.nurses]
+
+
+def test_who_is_announced_at_another_point_decides_where_it_is():
+    shifted = points(action_space_mapping=lambda action: action + 1)
+    env = aec_env(Announcing, shifted)
+    play(env, 0)
+    assert env.simulation.log == EXPECTED
+    env = parallel_env(Announcing, shifted)
+    env.reset()
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, 0))
+    assert env.simulation.log == EXPECTED
+
+
 def test_agents_with_one_name_share_a_string():
     ant, other = decision(agent="ant_0"), decision(agent="ant_0")
     for make in (aec_env, parallel_env):

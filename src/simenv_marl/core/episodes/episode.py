@@ -510,13 +510,16 @@ class Episode(EpisodeState):
             for call in expected_calls(point.hook.name):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
-                    agent = None if name is None else self.agent_for(handler, name)
-                    if agent is None or agent in known or agent.ended:
-                        continue
-                    known.add(agent)
-                    is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
-                    if everyone or is_asked:
-                        agent.keep(args, kwargs)
+                    agent = self.find(name) if isinstance(name, str) else None
+                    if agent is not None:
+                        is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
+                        if agent in known or agent.ended or not (everyone or is_asked):
+                            continue  # it stays at its point
+                    if name is not None:
+                        agent = self.agent_for(handler, name)
+                        known.add(agent)
+                        if everyone or not agent.delegated:
+                            agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on.

@@ -157,9 +157,15 @@ class TurnPolicy(_Deployed):
         told: Info = {"agent": [agent.name for agent in agents]}
         if all("time" in info for info in infos):
             told["time"] = np.array([info["time"] for info in infos])
-        if self._turn.has_masks:
-            masks: list[Any] = [self._turn.mask(agent) for agent in agents]
-            told[MASK] = np.stack(masks)
+        masks: list[Any] = [self._turn.mask(agent) for agent in agents]
+        if any(mask is not None for mask in masks):
+            for place, agent in enumerate(agents):
+                if masks[place] is None:
+                    masks[place] = agent.point.open_mask()
+            if isinstance(masks[0], tuple):
+                told[MASK] = tuple(map(np.stack, zip(*masks, strict=True)))
+            else:
+                told[MASK] = np.stack(masks)
         answers = self._ask(seen, told, self._turn.action_space, states)
         actions, extras = read_answers(answers, self.policy, len(agents))
         return list(map(self._own, agents, actions)), extras
@@ -167,8 +173,9 @@ class TurnPolicy(_Deployed):
     def _info(self, agent: Agent, info: Info) -> Info:
         """Return the info of a decision. Times since the last step are not known here."""
         told: Info = {"agent": agent.name}
-        if self._turn.has_masks:
-            told[MASK] = self._turn.mask(agent)
+        mask = self._turn.mask(agent)
+        if mask is not None:
+            told[MASK] = mask
         if "time" in info:
             told["time"] = info["time"]
         return told

@@ -68,7 +68,6 @@ class Turn:
     Attributes:
         observation_space, action_space: The spaces of the learner.
         translates: Whether the learner's actions differ from those of the agents.
-        has_masks: Whether infos have masks of its actions.
         is_plain: Whether results are the agents' own ones, with the kind, the name and the mask.
         seats: The seats by decision point.
     """
@@ -89,7 +88,6 @@ class Turn:
         masks = [code.widen(None) for code in codes]
         renewing = [None if mask is None else np.asarray(mask).copy for mask in masks]
         self.seats = _Seats(zip(hooks, map(Seat, kinds, encoders, codes, renewing), strict=True))
-        self.has_masks = any(mask is not None for mask in masks)
         parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
         self._indices: dict[str, np.int64] = {}
         if options.possible_agents is not None:

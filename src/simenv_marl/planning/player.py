@@ -374,7 +374,7 @@ class TurnPlayer(Player):
     ) -> None:
         super().__init__(env, base, "all agents")
         info: Info = {"agent": self.agent.name}
-        if self.view.turn.has_masks:
+        if self.mask is not None:
             info[MASK] = self.mask
         self.latest = {self.name: (self.view.turn.observe(self.agent), info)}
         if isinstance(base, Mapping) and self._space_of(self.name) != self.view.action_space:

@@ -12,6 +12,7 @@ import simenv_marl
 from simenv_marl import SimulationInterface, aec_env, generate_env, parallel_env, single_env
 from simenv_marl.core.plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions
 from simenv_marl.errors import (
+    AgentError,
     DefinitionError,
     NoDecisionError,
     UnknownOptionError,
@@ -62,11 +63,12 @@ def test_a_view_names_the_point_whose_space_prevents_it(view, part, space, match
         generate_env(Model, points, view=view, flatten=True)()
 
 
-@pytest.mark.parametrize("view", ["turn", "joint", "aec"])
-def test_one_agent_of_several_needs_the_single_view(view):
+def test_one_agent_of_several_needs_the_single_view():
     points = {CHOOSE: define(agent=lambda model: "a"), TELL: define(agent=lambda model: "b")}
+    with pytest.raises(AgentError, match="other views take no agent="):
+        generate_env(Model, points, view="turn", agent="a")
     with pytest.raises(UnknownOptionError, match=r"the single view only; .*policies="):
-        generate_env(Model, points, view=view, agent="a")
+        generate_env(Model, {CHOOSE: define()}, view="turn", agent="choose_0")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Views: an episode as a PettingZoo or Gymnasium environment, and the functions that make them."""
 
 import sys
-from typing import Any, Final, TypeVar, Unpack
+from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
@@ -14,7 +14,6 @@ from ..core import (
 )
 from ..errors import OptionValueError, did_you_mean, short_repr
 from .aec import SimulationAECEnv
-from .base import View
 from .joint import SimulationJointEnv
 from .padding import pad_agents
 from .parallel import SimulationParallelEnv
@@ -26,8 +25,6 @@ __all__ = [
     "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv",
     "SimulationTurnEnv", "SimulationVectorEnv", "pad_agents",
 ]  # fmt: skip
-
-Kind = TypeVar("Kind", bound=View)
 
 VIEWS: Final = {
     "aec": SimulationAECEnv,
@@ -69,8 +66,6 @@ def generate_env(
             agent is active, or if ``agent=`` names one agent; else AEC.
         {options}
     """
-    if view is not None and view in VIEWS:
-        VIEWS[view].check_options(options)
     plan = plan_of(simulation, points, options)
     base = view_class(plan, view)
     base.adapt(plan)  # raises errors at once
@@ -91,12 +86,6 @@ def generate_env(
     )
 
 
-def _make(kind: type[Kind], simulation: Model, points: Points, options: ViewOptions) -> Kind:
-    """Make a view. Refuse first the options that it does not take."""
-    kind.check_options(options)
-    return kind(plan_of(simulation, points, options))
-
-
 @explain_arguments
 def aec_env(
     simulation: Model,
@@ -108,7 +97,7 @@ def aec_env(
     {arguments}
         {options}
     """
-    return _make(SimulationAECEnv, simulation, points, options)
+    return SimulationAECEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -122,7 +111,7 @@ def parallel_env(
     {arguments}
         {options}
     """
-    return _make(SimulationParallelEnv, simulation, points, options)
+    return SimulationParallelEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -157,7 +146,7 @@ def joint_env(
     {arguments}
         {options}
     """
-    return _make(SimulationJointEnv, simulation, points, options)
+    return SimulationJointEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -174,7 +163,7 @@ def turn_env(
     {arguments}
         {options}
     """
-    return _make(SimulationTurnEnv, simulation, points, options)
+    return SimulationTurnEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Self, TypeAlias, TypeVar
 from zlib import crc32
@@ -142,7 +142,9 @@ class View:
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
-        cls.check_options(vars(plan.options))
+        for option, views in _OWN_OPTIONS.items():
+            if getattr(plan.options, option) and option not in cls._own_options:
+                raise UnknownOptionError(f"{option} is an option of {views}")
         for point in plan.active:
             first = plan.roster.get(point.agent or "", point)
             if not plan.can_share(point, first):
@@ -151,13 +153,6 @@ class View:
                     " but their spaces differ; name the agents differently, or use turn_env"
                 )
         return plan
-
-    @classmethod
-    def check_options(cls, options: Mapping[str, Any]) -> None:
-        """Refuse options that this view does not take."""
-        for option, views in _OWN_OPTIONS.items():
-            if options.get(option) and option not in cls._own_options:
-                raise UnknownOptionError(f"{option} is an option of {views}")
 
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:

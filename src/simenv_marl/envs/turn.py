@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from math import exp
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -27,12 +26,10 @@ from ..core import (
     common_observations,
 )
 from ..decision import DecisionPoint
-from ..errors import ViewError, listed, short_repr
+from ..errors import ViewError, listed
 from ..simulation import RULE
 from .agents import refuse_unknown_agents
 from .base import OneAgentView, StepResult
-
-United = TypeVar("United")
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""
@@ -76,12 +73,13 @@ class Turn:
         """Unite the spaces of the active points, or raise ``ViewError`` if that is not possible."""
         options = plan.options
         definitions = [point.definition for point in plan.active]
-        names = [point.hook.name for point in plan.active]
         seen = [each.observation_space for each in definitions]
-        common, encoders = _united(common_observations, seen, names)
         actions = [each.action_space for each in definitions]
-        unite = partial(common_actions, clips=options.clip_actions)
-        self.action_space, codes = _united(unite, actions, names)
+        try:
+            common, encoders = common_observations(seen)
+            self.action_space, codes = common_actions(actions, clips=options.clip_actions)
+        except ViewError as error:
+            raise _explained(error, plan) from None
         self.translates = any(space != self.action_space for space in actions)
         hooks = [point.hook for point in plan.active]
         kinds = map(np.int64, range(len(hooks)))
@@ -104,10 +102,8 @@ class Turn:
         if options.flatten:
             self.observation_space = spaces.flatten_space(self._whole)
             if not isinstance(self.observation_space, spaces.Box):
-                raise ViewError(
-                    "flatten=True needs observation spaces that can be flattened, not"
-                    f" {short_repr(common)} of {listed(names)}"
-                )
+                problem = f"flatten=True needs observations that can be flattened, not {common}"
+                raise _explained(ViewError(problem), plan)
 
     def observe(self, agent: Agent) -> Observation:
         """Return an agent's latest observation as one of the learner."""
@@ -146,21 +142,18 @@ class Turn:
         return self._beginnings[key]
 
 
-def _united(unite: Callable[[list[Space]], United], parts: list[Space], names: list[str]) -> United:
-    """Unite the spaces of decision points. In an error, name the points that prevent it."""
-    try:
-        return unite(parts)
-    except ViewError as error:
-        guilty = []
-        for part, name in zip(parts, names, strict=True):
-            try:
-                unite([part, spaces.Box(0, 1, (1,))])
-            except ViewError:
-                guilty.append(name)
-        raise ViewError(
-            f"{error}; it is the space of {listed(guilty)}, which needs another one, or an answer"
-            " by policies="
-        ) from None
+def _explained(error: ViewError, plan: Plan) -> ViewError:
+    """Add the decision points whose space an error names."""
+    names = [
+        point.hook.name
+        for point in plan.active
+        for space in (point.definition.observation_space, point.definition.action_space)
+        if f" {space}" in str(error)
+    ]
+    return ViewError(
+        f"{error}; it is the space of {listed(names)}, which needs another one, or an answer by"
+        " policies="
+    )
 
 
 class SimulationTurnEnv(OneAgentView):

@@ -567,8 +567,9 @@ def _choose_one(
     elif len(points) > 1:
         raise AgentError(
             f"the agent {short_repr(agent)} may decide at"
-            f" {', '.join(point.hook.name for point in points)}; name its decision point in"
-            " points=, or declare the agents of each with possible_agents="
+            f" {', '.join(point.hook.name for point in points)}; for a single view, name one of"
+            " these in points=, or declare the agents of each with possible_agents=; other views"
+            " take no agent="
         )
     return points, {agent: points[0]}
 

@@ -112,8 +112,7 @@ class Agent:
         plugins: The handlers that take part in its mappings.
         memory: Values of this agent in this episode: of differences, and of policies.
         reward: The reward of its previous action, as of its latest decision or its end.
-        raw_observation: The latest observation, where the user cannot have changed it. It is read
-            faster than ``observation``.
+        raw_observation: The latest observation, unless the user may have changed it.
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
         choices: The choices of the pending decision. None without ``choices=``.
@@ -458,8 +457,7 @@ class Agent:
     def refresh(self, *, reward: bool = True, asked: bool = False, last: bool = False) -> None:
         """Reward and observe the agent for the arguments of its latest decision, at any later time.
 
-        Where the model has freed an argument that a mapping takes, the reward is 0.0, and the last
-        observation stays.
+        If a mapping takes an argument that the model has freed, 0.0 and the last observation stay.
         """
         arguments = self.arguments
         if arguments.is_single and self._is_quick and reward and not DIFFERENCES:

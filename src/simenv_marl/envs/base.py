@@ -219,8 +219,7 @@ class View:
     @cached_property
     def state_space(self) -> Space | None:
         """The space of ``state()``, if the environment was made with one."""
-        reader: StateReader = self.session.plan.derive(StateReader)
-        return reader.space
+        return self.session.plan.derive(StateReader).space
 
     def state(self) -> Model:
         """Return the state of the simulation, for centralised critics.

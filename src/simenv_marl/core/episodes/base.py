@@ -212,8 +212,7 @@ class BaseSession(ABC):
 
     def read_state(self) -> Model:
         """Return the state of the simulation: see ``StateReader``."""
-        reader: StateReader = self.plan.derive(StateReader)
-        return reader.read(self)
+        return self.plan.derive(StateReader).read(self)
 
     def declare(self, plan: Plan) -> None:
         """Forget the episode that has shown the agents, and take over a plan that declares them."""

@@ -274,8 +274,7 @@ def handlers_of(plan: Plan, simulation: Model) -> Handlers:
     """
     if any(point.needs_simulation for point in plan.points):
         return _make_handlers(plan, simulation)
-    handlers: Handlers = plan.derive(_make_handlers)
-    return handlers
+    return plan.derive(_make_handlers)
 
 
 def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:

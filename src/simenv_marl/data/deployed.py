@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from ..core import (
     Info,
     Observation,
     Plan,
+    Space,
     is_asked_alone,
+    stacked,
     stacker,
     takes_state,
 )
@@ -97,22 +100,23 @@ def _plan_of(like: Any, kind: type[OneAgentView]) -> Plan:
 class _Deployed(EpisodePolicy):
     """A learner's policy for all agents."""
 
-    def __init__(self, predict: Predict, plan: Plan) -> None:
+    def __init__(self, predict: Predict, plan: Plan, batched: bool = False) -> None:
         if is_asked_alone(predict):
             raise OptionValueError(
                 f"{short_repr(predict)} must answer at once, and can ask for _state alone, not for"
                 " _environment or _decision"
             )
         self.policy = predict
+        self.batched = batched
         self.takes_state = takes_state(predict)
         self._call = Caller(predict)
         self._plan = plan
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.policy, self._plan)
+        return type(self), (self.policy, self._plan, self.batched)
 
     def _ask(
-        self, observation: Observation, info: Info, space: Any, state: object
+        self, observation: Observation, info: Info, space: Space, state: object
     ) -> tuple[Action, Any]:
         """Ask for an action in a space; return it, and the extras."""
         answer = self._call(observation, info, {"_state": state})
@@ -129,49 +133,39 @@ class _Deployed(EpisodePolicy):
 class TurnPolicy(_Deployed):
     """A policy for all agents of a learner of the turn view: see ``turn_policy``."""
 
-    def __init__(self, predict: Predict, plan: Plan, batched: bool = False) -> None:
-        super().__init__(predict, plan)
-        self.batched = batched
-        self._turn: Turn = plan.derive(Turn)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return TurnPolicy, (self.policy, self._plan, self.batched)
+    @cached_property
+    def _turn(self) -> Turn:
+        return self._plan.derive(Turn)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the action and the extras."""
-        seen = self._turn.observe(agent)
+        turn = self._turn
+        told: Info = {"agent": agent.name}
+        mask = turn.mask(agent)
+        if mask is not None:
+            told[MASK] = mask
+        if "time" in info:  # times since the last step are not known here
+            told["time"] = info["time"]
         state = episode.read_state() if self.takes_state else None
-        told = self._info(agent, info)
-        action, extras = self._ask(seen, told, self._turn.action_space, state)
-        return self._own(agent, action), extras
+        action, extras = self._ask(turn.observe(agent), told, turn.action_space, state)
+        return turn.decode(agent, action), extras
 
     def respond_to_many(
         self, agents: Sequence[Agent], infos: Sequence[Info], states: object
     ) -> Action:
         """Answer many decisions at once with the actions and the extras."""
-        stack = stacker(self._turn.observation_space, cast=True)
-        seen = stack([self._turn.observe(agent) for agent in agents])
+        turn = self._turn
+        stack = stacker(turn.observation_space, cast=True)
         told: Info = {"agent": [agent.name for agent in agents]}
         if all("time" in info for info in infos):
             told["time"] = np.array([info["time"] for info in infos])
-        if self._turn.has_masks:
-            masks: list[Any] = [self._turn.mask(agent) for agent in agents]
-            told[MASK] = np.stack(masks)
-        answers = self._ask(seen, told, self._turn.action_space, states)
+        masks = list(map(turn.mask, agents))
+        if not any(mask is None for mask in masks):
+            told[MASK] = stacked(masks)
+        seen = stack(list(map(turn.observe, agents)))
+        answers = self._ask(seen, told, turn.action_space, states)
         actions, extras = read_answers(answers, self.policy, len(agents))
-        return list(map(self._own, agents, actions)), extras
-
-    def _info(self, agent: Agent, info: Info) -> Info:
-        """Return the info of a decision. Times since the last step are not known here."""
-        told: Info = {"agent": agent.name}
-        if self._turn.has_masks:
-            told[MASK] = self._turn.mask(agent)
-        if "time" in info:
-            told["time"] = info["time"]
-        return told
-
-    def _own(self, agent: Agent, action: Action) -> Action:
-        return action if action is RULE else self._turn.decode(agent, action)
+        return list(map(turn.decode, agents, actions)), extras
 
 
 class JointPolicy(_Deployed):
@@ -180,9 +174,9 @@ class JointPolicy(_Deployed):
     looks_back = True
     sees_all = True
 
-    def __init__(self, predict: Predict, plan: Plan) -> None:
-        super().__init__(predict, plan)
-        self._joint: Joint = plan.derive(Joint)
+    @cached_property
+    def _joint(self) -> Joint:
+        return self._plan.derive(Joint)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the agent's action of the round. Begin another without one."""
@@ -201,10 +195,8 @@ class JointPolicy(_Deployed):
         """Ask for the actions of all live agents, and return them."""
         episode.observe_others(deciding)
         found = {name: episode.find(name) for name in self._joint.roster}
-        seen, told = self._joint.see(list(found.values()))
         unused = episode.memory.get(self, found)
-        told["deciding"] = deciding.name
-        told["acted"] = {name: name not in unused for name in found}
+        seen, told = self._joint.see(list(found.values()), deciding, found.keys() - unused)
         state = episode.read_state() if self.takes_state else None
         answer, _ = self._ask(seen, told, self._joint.action_space, state)
         live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}

@@ -317,7 +317,7 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
-        observation = self.view.joint.read(self.episode, None)[0]
+        observation = self.view.joint.read(self.episode)[0]
         self.latest = {self.name: (observation, {})}
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
             raise OptionValueError(
@@ -361,7 +361,7 @@ class TurnPlayer(Player):
     ) -> None:
         super().__init__(env, base, "all agents")
         info: Info = {"agent": self.agent.name}
-        if self.view.turn.has_masks:
+        if self.mask is not None:
             info[MASK] = self.mask
         self.latest = {self.name: (self.view.turn.observe(self.agent), info)}
         if isinstance(base, Mapping) and self._space_of(self.name) != self.view.action_space:

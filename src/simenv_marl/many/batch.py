@@ -230,7 +230,7 @@ class Group:
         try:
             states = None
             if policy.takes_state:
-                states = stacked([episode.note_states().read() for episode in episodes])
+                states = stacked([episode.note_state() for episode in episodes])
             if isinstance(policy.policy, EpisodePolicy):
                 agents = [episode.deciding for episode in episodes]
                 answers = policy.policy.respond_to_many(agents, infos, states)

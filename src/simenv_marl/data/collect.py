@@ -40,7 +40,6 @@ from ..many.batch import (
     BatchRun,
     PolicyKey,
     policy_keys,
-    read_answers,
 )
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
@@ -307,8 +306,7 @@ class Mixture:
             rows = index.tolist()
             if not rows:
                 continue
-            actions = _actions(
-                part,
+            actions, _ = part.answers(
                 taken(observations, index),
                 [infos[row] for row in rows],
                 [identities[row] for row in rows],
@@ -335,18 +333,6 @@ def _check_part(policy: Any, weight: Any) -> None:
             f"the weight of {short_repr(policy)} must be a number that is not negative, not"
             f" {short_repr(weight)}"
         )
-
-
-def _actions(
-    policy: BatchPolicy,
-    observations: Observation,
-    infos: Infos,
-    identities: Identities,
-    states: Any,
-) -> list[Action]:
-    """Ask a policy for one action for each decision, and drop its extras."""
-    answers = policy.answers(observations, infos, identities, states)
-    return read_answers(answers, policy.policy, len(identities))[0]
 
 
 def _random_numbers(identities: Identities) -> Array:
@@ -472,7 +458,7 @@ class _BatchedShadow:
         *,
         _state: Any = None,
     ) -> Any:
-        actions = _actions(self._policy, observations, infos, identities, _state)
+        actions, _ = self._policy.answers(observations, infos, identities, _state)
         return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 

@@ -30,7 +30,7 @@ from ..envs.base import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
 from ..errors import OptionValueError, UnknownAgentError, short_repr
-from ..many.batch import read_answers
+from ..many.batch import Answers, read_answers
 from ..simulation import EVERYONE, RULE
 
 Predict = Callable[..., Any]
@@ -152,7 +152,7 @@ class TurnPolicy(_Deployed):
 
     def respond_to_many(
         self, agents: Sequence[Agent], infos: Sequence[Info], states: object
-    ) -> Action:
+    ) -> Answers:
         """Answer many decisions at once with the actions and the extras."""
         turn = self._turn
         stack = stacker(turn.observation_space, cast=True)

@@ -40,7 +40,6 @@ from ...hooks.stacks import EVALUATING
 from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
-    AskingPolicy,
     DeferredPolicy,
     EpisodePolicy,
     Where,
@@ -346,7 +345,7 @@ class Episode(EpisodeState):
         if policy is RULE:
             return RULE
         self.latest = agent
-        is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
+        is_rewarded = isinstance(policy, EpisodePolicy) and policy.asks
         agent.update(args, kwargs, reward=is_rewarded)
         if self.skips:
             reply = agent.reply_if_forced()

@@ -57,7 +57,7 @@ from .points import (
     resolve_policies,
     resolve_roster,
 )
-from .policies import AskingPolicy, DeferredPolicy
+from .policies import DeferredPolicy, EpisodePolicy
 
 DRIVERS: Final[Mapping[str, type[Driver]]] = {
     "greenlet": GreenletDriver,
@@ -501,7 +501,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         policies=by_agent,
         everyone=everyone,
         has_planner=any(
-            isinstance(policy, AskingPolicy) and policy.plans
+            isinstance(policy, EpisodePolicy) and policy.plans
             for policy in (*by_point.values(), *by_agent.values())
         ),
         has_split=any(point.split is not None for point in points),

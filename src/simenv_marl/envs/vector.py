@@ -41,9 +41,9 @@ from .base import OneAgentView, ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
 from .turn import SimulationTurnEnv
-from .vector_batch import Infos, SimulationBatch, StackedView, make_batch
+from .vector_batch import Infos, SimulationBatch, make_batch
 
-VIEWS: Final[Mapping[str, type[StackedView]]] = {
+VIEWS: Final[Mapping[str, type[OneAgentView]]] = {
     "single": SimulationEnv,
     "joint": SimulationJointEnv,
     "turn": SimulationTurnEnv,
@@ -346,7 +346,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             raise AttributeError(
                 "the sub-environments are in other processes; use call(), get_attr() and set_attr()"
             )
-        return list(self._simulations.views)
+        return self._simulations.views
 
     def call(
         self,

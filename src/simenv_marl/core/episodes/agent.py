@@ -129,6 +129,7 @@ class Agent:
         now: The time of the latest decision.
         fallbacks: The number of its decisions that a fallback has answered.
         fault: Why its rewards are wrong. Empty as far as is known.
+        applying: How many of its calls of ``apply`` run, on the simulation's side.
     """
 
     name: str
@@ -161,7 +162,7 @@ class Agent:
     now: float | None = None
     fallbacks: int = 0
     fault: str = ""
-    _applying: int = 0
+    applying: int = 0
 
     def __post_init__(self) -> None:
         self.point = self.handler.point
@@ -183,7 +184,7 @@ class Agent:
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision. Return this agent if it waits for the user, else the reply."""
-        if self._applying:
+        if self.applying:
             return RULE
         if self.delegated:
             return episode.ask(self, args, kwargs)
@@ -297,16 +298,11 @@ class Agent:
 
     def begin_apply(self) -> None:
         """Let the agent's calls run the rule, on the simulation's side."""
-        self._applying += 1
-
-    @property
-    def is_applying(self) -> bool:
-        """Whether its ``apply`` runs, on the simulation's side."""
-        return self._applying > 0
+        self.applying += 1
 
     def end_apply(self) -> None:
         """Undo ``begin_apply``."""
-        self._applying -= 1
+        self.applying -= 1
 
     def count_fallback(self) -> None:
         """Count a decision that a fallback has answered."""

@@ -73,7 +73,7 @@ class Episode(EpisodeState):
         moved: The names of agents that have decided at several points.
         end_states: The states at the ends of agents midway. None if no learner has asked for any.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
-        replay: The policy that repeats another episode. None in ordinary episodes.
+        replay: The answers of the episode that this one repeats. None in ordinary episodes.
     """
 
     __slots__ = (
@@ -363,10 +363,10 @@ class Episode(EpisodeState):
     def _consult(self, agent: Agent, policy: Policy) -> Action:
         """Call the policy of an agent. ``WAIT`` where a replay ends."""
         if self.replay is not None:
-            action = self.replay.answer()
-            if action is WAIT:
+            if not self.replay:  # the other episode stands here
                 self.consulted = self.pending = agent
                 return WAIT
+            action = self.replay.popleft()
         else:
             self.consulted = agent
             observation = duplicate(agent.raw_observation)  # which the policy may change

@@ -200,7 +200,7 @@ class RuleHandler(Observer):
             agent = episode.agents.get(name) or episode.others.get(name)
         if agent is None or agent.point is not point:
             return
-        if agent.is_applying:  # its own ``apply`` runs the rule
+        if agent.applying:  # its own ``apply`` runs the rule
             return
         episode.blame(agent)
         action = self._action(decision, args, kwargs, agent)

@@ -381,8 +381,8 @@ class Session(BaseSession):
         episode = self.start(
             recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
         )
-        while replay.answers:
-            answer = replay.answer()
+        while replay:
+            answer = replay.popleft()
             if isinstance(answer, _Reseeded):
                 self.reseed(answer.seed)
             else:

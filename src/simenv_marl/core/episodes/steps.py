@@ -43,11 +43,6 @@ class Round:
         self.stalled = 0
         self._pending = ""  # the agent whose decision waited when the round began
 
-    @property
-    def given(self) -> int:
-        """The number of actions in the episode, other than ``RULE``."""
-        return self.used + self.unused
-
     def begin(self, actions: dict[str, Action], pending: str) -> None:
         """Begin a round with checked actions. ``pending``: the agent whose decision waits."""
         self.actions = actions
@@ -77,10 +72,11 @@ class Round:
 
     def explain_losses(self) -> str:
         """Explain how many actions were lost. Empty if at least nine in ten were used."""
-        if 10 * self.used >= 9 * self.given:
+        given = self.used + self.unused
+        if 10 * self.used >= 9 * given:
             return ""
         return (
-            f"of {self.given} actions in this episode, {self.used} were used: the agents do not"
+            f"of {given} actions in this episode, {self.used} were used: the agents do not"
             " decide in each round, and the other actions are lost;"
             f" {self.early} decisions were answered by an action that was chosen before they"
             " arose. aec_env loses none, nor does turn_env, for one learner"

@@ -9,6 +9,7 @@ from collections.abc import (
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from math import inf
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -50,6 +51,7 @@ from ..simulation import (
     Model,
     Observation,
     Sentinel,
+    is_number,
 )
 from .trajectories import (
     Array,
@@ -272,7 +274,21 @@ class Mixture:
                 f" {short_repr(parts)}"
             ) from None
         for policy, weight in zip(policies, weights, strict=True):
-            _check_part(policy, weight)
+            if policy is not RULE and not callable(policy):
+                raise OptionValueError(
+                    "a mixture consists of policies, callables or RULE, not of"
+                    f" {short_repr(policy)}"
+                )
+            if is_asked_alone(policy):
+                raise OptionValueError(
+                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in"
+                    " batches"
+                )
+            if not is_number(weight) or not 0 <= weight < inf:
+                raise OptionValueError(
+                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
+                    f" {short_repr(weight)}"
+                )
         if not any(weights):
             raise OptionValueError("at least one weight of a mixture must be positive")
         self.policies: tuple[Policy, ...] = policies
@@ -315,24 +331,6 @@ class Mixture:
             for row, action in zip(rows, actions, strict=True):
                 answers[row] = action
         return answers, {"component": component}
-
-
-def _check_part(policy: Any, weight: Any) -> None:
-    """Check a policy of a mixture and its weight."""
-    if policy is not RULE and not callable(policy):
-        raise OptionValueError(
-            f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
-        )
-    if is_asked_alone(policy):
-        raise OptionValueError(
-            f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
-        )
-    is_number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
-    if not is_number or not 0 <= weight < float("inf"):
-        raise OptionValueError(
-            f"the weight of {short_repr(policy)} must be a number that is not negative, not"
-            f" {short_repr(weight)}"
-        )
 
 
 def _random_numbers(identities: Identities) -> Array:

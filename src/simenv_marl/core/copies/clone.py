@@ -175,7 +175,12 @@ def branch(
     if not is_seed(n):
         raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
     if seeds is not None:
-        _check_seeds(seeds, n)
+        is_listed = isinstance(seeds, (Sequence, np.ndarray))
+        if not (is_listed and len(seeds) == n and all(map(is_seed, seeds))):
+            raise OptionValueError(
+                f"seeds must be n = {n} non-negative integers, one for each branch, not"
+                f" {short_repr(seeds)}"
+            )
         view.session.check_reseed()
     if DEPTH.get() == DEEPEST:
         raise BranchError(
@@ -227,15 +232,6 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
             f"time_limit must be a number of seconds, not {short_repr(time_limit)}"
         )
     return view
-
-
-def _check_seeds(seeds: Sequence[int], n: int) -> None:
-    is_listed = isinstance(seeds, (Sequence, np.ndarray))
-    if not (is_listed and len(seeds) == n and all(map(is_seed, seeds))):
-        raise OptionValueError(
-            f"seeds must be n = {n} non-negative integers, one for each branch, not"
-            f" {short_repr(seeds)}"
-        )
 
 
 # -- branches: clones for one call ----------------------------------------------------------------

@@ -267,8 +267,13 @@ class Agent:
         """
         point = self.point
         reply: Model = action
-        if self.choices is not None:
-            reply = self._take_choice(action, self.choices)
+        choices = self.choices
+        if choices is not None:
+            self.choices = None  # the others are forgotten
+            if point.reports_rule:
+                self.offered = [weaken(choice) for choice in choices]
+            if action is not RULE:
+                reply = [choices[action]]
         elif action is not RULE:
             convert = point.convert
             reply = convert(action)
@@ -288,13 +293,6 @@ class Agent:
         forced = self.only_action()
         self.carry_reward(forced is not None or not self.asked)
         return self if forced is None else self.reply_to(forced, forced=True)
-
-    def _take_choice(self, action: Action, choices: list[Model]) -> Model:
-        """Return the choice of an action in a list, and forget the others."""
-        self.choices = None
-        if self.point.reports_rule:
-            self.offered = [weaken(choice) for choice in choices]
-        return action if action is RULE else [choices[action]]
 
     def begin_apply(self) -> None:
         """Let the agent's calls run the rule, on the simulation's side."""

@@ -9,7 +9,7 @@ import copy
 from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ...errors import (
     BranchError,
@@ -123,31 +123,11 @@ class Mirror(EpisodeState):
 # -- the clone's process ---------------------------------------------------------------------------
 
 
-class HostedView(Protocol):
-    """A view in the process of a clone."""
-
-    @property
-    def episode(self) -> Episode:
-        """The episode."""
-
-    @property
-    def session(self) -> Session:
-        """The session."""
-
-    def begin_branch(self) -> None:
-        """Prepare the view of a branch."""
-
-    def export_state(self) -> dict[str, Any]:
-        """Return the state of the view."""
-
-    def import_state(self, state: dict[str, Any]) -> None:
-        """Take over the state of its twin."""
-
-
 class Host:
     """The environment in the process of a clone. Its methods answer requests."""
 
-    def __init__(self, view: HostedView) -> None:
+    def __init__(self, view: Model) -> None:
+        """Serve an unwrapped view."""
         self._view = view
         self._reported: Episode | None = None  # all its agents were reported
         self._latest: Agent | None = None  # was pending at the latest report

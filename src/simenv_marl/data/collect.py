@@ -128,7 +128,12 @@ def collect_episodes(
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
         BaseException: Any other error of ``simulate_many``.
     """
-    policies = _by_point(simulation, checked_policies(policies), points, options)
+    policies = checked_policies(policies)
+    if EVERYONE in policies:
+        # One for each point, because the points of one learner may have different spaces.
+        plan = learners_plan(simulation, policies, points, options)
+        named = dict.fromkeys([point.hook.name for point in plan.points], policies[EVERYONE])
+        policies = named | {key: each for key, each in policies.items() if key is not EVERYONE}
     seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
     make_plan = partial(learners_plan, simulation, policies, points, options)
@@ -143,20 +148,6 @@ def collect_episodes(
         key: combine([records[place] for records, *_ in parts], tuple(seed_list), collected, errors)
         for place, key in enumerate(policies)
     }
-
-
-def _by_point(
-    simulation: Model, policies: Policies, points: Points, options: Mapping[str, Any]
-) -> Policies:
-    """Return policies with one for each point in place of one for all agents.
-
-    The points of one learner may have different spaces, so each has trajectories of its own.
-    """
-    if EVERYONE not in policies:
-        return policies
-    plan = learners_plan(simulation, policies, points, options)
-    named = dict.fromkeys([point.hook.name for point in plan.points], policies[EVERYONE])
-    return named | {key: policy for key, policy in policies.items() if key is not EVERYONE}
 
 
 @dataclass(frozen=True)

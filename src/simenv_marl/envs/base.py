@@ -7,12 +7,7 @@ import pickle
 import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import (
-    Any,
-    Self,
-    TypeAlias,
-    TypeVar,
-)
+from typing import Any, Self, TypeAlias, TypeVar
 from zlib import crc32
 
 import gymnasium as gym
@@ -603,28 +598,3 @@ class OneAgentView(View, gym.Env[Any, Any]):
         for mask in self.masks():
             parts += mask if isinstance(mask, tuple) else (mask,)
         return np.concatenate(parts).astype(np.bool_)
-
-
-class UnitedView(OneAgentView):
-    """A view with one learner for all agents, which have united spaces."""
-
-    _own_options = ("flatten", "state_in_info")
-    _last_time: float | None = None  # the time of the previous reset or step
-    _unite: Callable[[Plan], Any]  # returns an object with both spaces
-
-    @classmethod
-    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
-        """Return the united spaces of a plan's agents."""
-        united = plan.derive(cls._unite)
-        return united.observation_space, united.action_space
-
-    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
-        return self.spaces_of(self.session.plan)
-
-    def _add_to(self, info: Info, episode: EpisodeState) -> None:
-        """Add the time since the last step, and the state, to an info."""
-        if episode.clock is not None:
-            info |= episode.clock.read(self._last_time)
-            self._last_time = info["time"]
-        if episode.plan.options.state_in_info:
-            info["state"] = self.state()

@@ -23,7 +23,8 @@ from ..core import (
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE, optional_method
-from .base import StepResult, UnitedView
+from .agents import UnitedView
+from .base import StepResult
 
 
 class Joint:

@@ -30,8 +30,8 @@ from ..core import (
 from ..decision import DecisionPoint
 from ..errors import ViewError, short_repr
 from ..simulation import RULE
-from .agents import refuse_unknown_agents
-from .base import StepResult, UnitedView
+from .agents import UnitedView, refuse_unknown_agents
+from .base import StepResult
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""

@@ -346,7 +346,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             raise AttributeError(
                 "the sub-environments are in other processes; use call(), get_attr() and set_attr()"
             )
-        return self._simulations.views
+        return list(self._simulations.views)
 
     def call(
         self,

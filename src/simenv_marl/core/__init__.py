@@ -21,9 +21,8 @@ from .episodes.decision import Decision
 from .episodes.episode import Episode
 from .episodes.session import Session
 from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
-from .episodes.steps import Round
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
-from .plans.plan import Mode, Plan, Source, make_plan, source_name
+from .plans.plan import Mode, Plan, Source, make_plan
 from .plans.point import Labels, Point, Policy, Space
 from .plans.points import Points, portable
 from .plans.policies import (
@@ -50,7 +49,6 @@ from .plans.policies import (
 from .plans.provenance import as_json, describe, provenance
 from .switching.awaiting import Answer, Answers
 from .switching.context import GlobalRandom, environment_context, preserve_generators
-from .switching.driver import Driver
 from .switching.exits import LoopExit
 from .switching.generators import (
     Streams,
@@ -68,13 +66,13 @@ from .values.common import (
     common_observations,
     preferences,
 )
-from .values.spaces import blank, duplicate, observation_cast, same
+from .values.spaces import blank, duplicate, same
 from .values.stacking import Stacker, joined, split_batch, stacked, stacker, taken
 
 __all__ = [  # noqa: RUF022 - by subject
     # What an environment is made of, and what happens in it.
-    "Agent", "BaseSession", "Decision", "Driver", "Episode", "EpisodeState", "Mode", "Plan",
-    "Point", "Round", "Session", "StateReader", "UnmatchedNames", "Where", "checked_actions",
+    "Agent", "BaseSession", "Decision", "Episode", "EpisodeState", "Mode", "Plan",
+    "Point", "Session", "StateReader", "UnmatchedNames", "Where", "checked_actions",
     "checked_seed", "close_all", "describe", "make_plan", "provenance",
     # Types: the first three are the aliases of values of the user.
     "Observation", "Action", "Model", "Info", "Labels", "Mask", "Points", "Policy", "Source",
@@ -89,8 +87,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
-    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast",
-    "preferences", "same", "source_name", "split_batch", "stacked", "stacker", "taken",
+    "common_observations", "duplicate", "explain_arguments", "joined",
+    "preferences", "same", "split_batch", "stacked", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",
     "is_seed", "preserve_generators", "reseed_generators",

@@ -9,6 +9,7 @@ from collections.abc import (
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from math import inf
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -41,7 +42,6 @@ from ..many.batch import (
     BatchRun,
     PolicyKey,
     policy_keys,
-    read_answers,
 )
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
@@ -52,6 +52,7 @@ from ..simulation import (
     Model,
     Observation,
     Sentinel,
+    is_number,
 )
 from .trajectories import (
     Array,
@@ -128,7 +129,12 @@ def collect_episodes(
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
         BaseException: Any other error of ``simulate_many``.
     """
-    policies = _by_point(simulation, checked_policies(policies), points, options)
+    policies = checked_policies(policies)
+    if EVERYONE in policies:
+        # One for each point, because the points of one learner may have different spaces.
+        plan = learners_plan(simulation, policies, points, options)
+        named = dict.fromkeys([point.hook.name for point in plan.points], policies[EVERYONE])
+        policies = named | {key: each for key, each in policies.items() if key is not EVERYONE}
     seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
     make_plan = partial(learners_plan, simulation, policies, points, options)
@@ -143,20 +149,6 @@ def collect_episodes(
         key: combine([records[place] for records, *_ in parts], tuple(seed_list), collected, errors)
         for place, key in enumerate(policies)
     }
-
-
-def _by_point(
-    simulation: Model, policies: Policies, points: Points, options: Mapping[str, Any]
-) -> Policies:
-    """Return policies with one for each point in place of one for all agents.
-
-    The points of one learner may have different spaces, so each has trajectories of its own.
-    """
-    if EVERYONE not in policies:
-        return policies
-    plan = learners_plan(simulation, policies, points, options)
-    named = dict.fromkeys([point.hook.name for point in plan.points], policies[EVERYONE])
-    return named | {key: policy for key, policy in policies.items() if key is not EVERYONE}
 
 
 @dataclass(frozen=True)
@@ -274,7 +266,21 @@ class Mixture:
                 f" {short_repr(parts)}"
             ) from None
         for policy, weight in zip(policies, weights, strict=True):
-            _check_part(policy, weight)
+            if policy is not RULE and not callable(policy):
+                raise OptionValueError(
+                    "a mixture consists of policies, callables or RULE, not of"
+                    f" {short_repr(policy)}"
+                )
+            if is_asked_alone(policy):
+                raise OptionValueError(
+                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in"
+                    " batches"
+                )
+            if not is_number(weight) or not 0 <= weight < inf:
+                raise OptionValueError(
+                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
+                    f" {short_repr(weight)}"
+                )
         if not any(weights):
             raise OptionValueError("at least one weight of a mixture must be positive")
         self.policies: tuple[Policy, ...] = policies
@@ -308,8 +314,7 @@ class Mixture:
             rows = index.tolist()
             if not rows:
                 continue
-            actions = _actions(
-                part,
+            actions, _ = part.answers(
                 taken(observations, index),
                 [infos[row] for row in rows],
                 [identities[row] for row in rows],
@@ -318,36 +323,6 @@ class Mixture:
             for row, action in zip(rows, actions, strict=True):
                 answers[row] = action
         return answers, {"component": component}
-
-
-def _check_part(policy: Any, weight: Any) -> None:
-    """Check a policy of a mixture and its weight."""
-    if policy is not RULE and not callable(policy):
-        raise OptionValueError(
-            f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
-        )
-    if is_asked_alone(policy):
-        raise OptionValueError(
-            f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
-        )
-    is_number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
-    if not is_number or not 0 <= weight < float("inf"):
-        raise OptionValueError(
-            f"the weight of {short_repr(policy)} must be a number that is not negative, not"
-            f" {short_repr(weight)}"
-        )
-
-
-def _actions(
-    policy: BatchPolicy,
-    observations: Observation,
-    infos: Infos,
-    identities: Identities,
-    states: Any,
-) -> list[Action]:
-    """Ask a policy for one action for each decision, and drop its extras."""
-    answers = policy.answers(observations, infos, identities, states)
-    return read_answers(answers, policy.policy, len(identities))[0]
 
 
 def _random_numbers(identities: Identities) -> Array:
@@ -473,7 +448,7 @@ class _BatchedShadow:
         *,
         _state: Any = None,
     ) -> Any:
-        actions = _actions(self._policy, observations, infos, identities, _state)
+        actions, _ = self._policy.answers(observations, infos, identities, _state)
         return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 

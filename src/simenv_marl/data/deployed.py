@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from ..core import (
     Info,
     Observation,
     Plan,
+    Space,
     is_asked_alone,
+    stacked,
     stacker,
     takes_state,
 )
@@ -27,7 +30,7 @@ from ..envs.base import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
 from ..errors import OptionValueError, UnknownAgentError, name_of, short_repr
-from ..many.batch import read_answers
+from ..many.batch import Answers, read_answers
 from ..simulation import EVERYONE, RULE
 
 Predict = Callable[..., Any]
@@ -97,25 +100,26 @@ def _plan_of(like: Any, kind: type[OneAgentView]) -> Plan:
 class _Deployed(EpisodePolicy):
     """A learner's policy for all agents."""
 
-    def __init__(self, predict: Predict, plan: Plan) -> None:
+    def __init__(self, predict: Predict, plan: Plan, batched: bool = False) -> None:
         if is_asked_alone(predict):
             raise OptionValueError(
                 f"{short_repr(predict)} must answer at once, and can ask for _state alone, not for"
                 " _environment or _decision"
             )
         self.policy = predict
+        self.batched = batched
         self.takes_state = takes_state(predict)
         self._call = Caller(predict)
         self._plan = plan
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.policy, self._plan)
+        return type(self), (self.policy, self._plan, self.batched)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {name_of(self.policy)}>"  # also in provenance
 
     def _ask(
-        self, observation: Observation, info: Info, space: Any, state: object
+        self, observation: Observation, info: Info, space: Space, state: object
     ) -> tuple[Action, Any]:
         """Ask for an action in a space; return it, and the extras."""
         answer = self._call(observation, info, {"_state": state})
@@ -132,56 +136,39 @@ class _Deployed(EpisodePolicy):
 class TurnPolicy(_Deployed):
     """A policy for all agents of a learner of the turn view: see ``turn_policy``."""
 
-    def __init__(self, predict: Predict, plan: Plan, batched: bool = False) -> None:
-        super().__init__(predict, plan)
-        self.batched = batched
-        self._turn: Turn = plan.derive(Turn)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return TurnPolicy, (self.policy, self._plan, self.batched)
+    @cached_property
+    def _turn(self) -> Turn:
+        return self._plan.derive(Turn)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the action and the extras."""
-        seen = self._turn.observe(agent)
+        turn = self._turn
+        told: Info = {"agent": agent.name}
+        mask = turn.mask(agent)
+        if mask is not None:
+            told[MASK] = mask
+        if "time" in info:  # times since the last step are not known here
+            told["time"] = info["time"]
         state = episode.read_state() if self.takes_state else None
-        told = self._info(agent, info)
-        action, extras = self._ask(seen, told, self._turn.action_space, state)
-        return self._own(agent, action), extras
+        action, extras = self._ask(turn.observe(agent), told, turn.action_space, state)
+        return turn.decode(agent, action), extras
 
     def respond_to_many(
         self, agents: Sequence[Agent], infos: Sequence[Info], states: object
-    ) -> Action:
+    ) -> Answers:
         """Answer many decisions at once with the actions and the extras."""
-        stack = stacker(self._turn.observation_space, cast=True)
-        seen = stack([self._turn.observe(agent) for agent in agents])
+        turn = self._turn
+        stack = stacker(turn.observation_space, cast=True)
         told: Info = {"agent": [agent.name for agent in agents]}
         if all("time" in info for info in infos):
             told["time"] = np.array([info["time"] for info in infos])
-        masks: list[Any] = [self._turn.mask(agent) for agent in agents]
-        if any(mask is not None for mask in masks):
-            for place, agent in enumerate(agents):
-                if masks[place] is None:
-                    masks[place] = agent.point.open_mask()
-            if isinstance(masks[0], tuple):
-                told[MASK] = tuple(map(np.stack, zip(*masks, strict=True)))
-            else:
-                told[MASK] = np.stack(masks)
-        answers = self._ask(seen, told, self._turn.action_space, states)
+        masks = list(map(turn.mask, agents))
+        if not any(mask is None for mask in masks):
+            told[MASK] = stacked(masks)
+        seen = stack(list(map(turn.observe, agents)))
+        answers = self._ask(seen, told, turn.action_space, states)
         actions, extras = read_answers(answers, self.policy, len(agents))
-        return list(map(self._own, agents, actions)), extras
-
-    def _info(self, agent: Agent, info: Info) -> Info:
-        """Return the info of a decision. Times since the last step are not known here."""
-        told: Info = {"agent": agent.name}
-        mask = self._turn.mask(agent)
-        if mask is not None:
-            told[MASK] = mask
-        if "time" in info:
-            told["time"] = info["time"]
-        return told
-
-    def _own(self, agent: Agent, action: Action) -> Action:
-        return action if action is RULE else self._turn.decode(agent, action)
+        return list(map(turn.decode, agents, actions)), extras
 
 
 class JointPolicy(_Deployed):
@@ -190,9 +177,10 @@ class JointPolicy(_Deployed):
     looks_back = True
     sees_all = True
 
-    def __init__(self, predict: Predict, plan: Plan) -> None:
-        super().__init__(predict, plan)
-        self.joint: Joint = plan.derive(Joint)
+    @cached_property
+    def joint(self) -> Joint:
+        """The joint view's spaces."""
+        return self._plan.derive(Joint)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the agent's action of the round. Begin another without one."""
@@ -220,10 +208,8 @@ class JointPolicy(_Deployed):
         """Answer with the joint action. ``deciding``: the agent whose decision is pending."""
         episode.observe_others(deciding)
         found = {name: episode.find(name) for name in self.joint.roster}
-        seen, told = self.joint.see(list(found.values()))
         unused = episode.memory.get(self, found)
-        told["deciding"] = deciding.name
-        told["acted"] = {name: name not in unused for name in found}
+        seen, told = self.joint.see(list(found.values()), deciding, found.keys() - unused)
         state = episode.read_state() if self.takes_state else None
         answer, _ = self._ask(seen, told, self.joint.action_space, state)
         return answer

@@ -213,7 +213,16 @@ def plot_timeline(
             " decided in it"
         )
     if agents is not None:
-        rows = _choose(rows, agents, number)
+        if isinstance(agents, str) or not agents:
+            raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
+        by_name = {row.agent: row for row in rows}
+        try:
+            rows = [by_name[name] for name in dict.fromkeys(agents)]
+        except KeyError as error:
+            raise UnknownAgentError(
+                f"the agent {error} did not decide in episode {number}; these agents did:"
+                f" {short_repr(list(by_name))}"
+            ) from None
     begin = min(row.times[0] for row in rows)
     end = max(row.end for row in rows)
     margin = 0.015 * (end - begin or 1.0)
@@ -275,20 +284,6 @@ def _components(
             name = part if len(columns) == 1 else f"{part}[{place}]"
             components[name] = _Component(part, values, labels)
     return components
-
-
-def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) -> list[TimelineRow]:
-    """Return the rows of some agents, in the order of ``agents``."""
-    if isinstance(agents, str) or not agents:
-        raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
-    by_name = {row.agent: row for row in rows}
-    try:
-        return [by_name[name] for name in dict.fromkeys(agents)]
-    except KeyError as error:
-        raise UnknownAgentError(
-            f"the agent {error} did not decide in episode {episode}; these agents did:"
-            f" {short_repr(list(by_name))}"
-        ) from None
 
 
 def _explain_marks(

@@ -332,7 +332,7 @@ class _DecisionLog:
         if group.point.legal is not None:
             batch["action_masks"] = stacked([agent.mask for agent in agents])
         if self._stack_states is not None:
-            states = [episode.note_states().read() for episode in episodes]
+            states = [episode.note_state() for episode in episodes]
             batch["states"] = self._stack_states(states)
         self.batches.append(batch)
         table = self.table
@@ -440,14 +440,14 @@ class Recorder:
         """Record the rewards and the ends of agents: see ``Watcher``."""
         if episode.pending is not None:
             self._pay(episode.pending)
-        ends = {} if episode.states is None else episode.states.ends
+        ends = episode.end_states or {}
         for agent in episode.take_ended():
             self._pay(agent, (episode.turns, True, False, ends.pop(agent, None)))
         if episode.over:
             agents = [agent for agent in episode.agents.values() if agent in self._decisions]
             state = None
             if agents and self._stack_states is not None:
-                state = episode.note_states().read()
+                state = episode.note_state()
             for agent in agents:
                 self._pay(agent, (episode.turns, episode.terminated, episode.truncated, state))
 

@@ -1,11 +1,12 @@
-"""The parts that the views of several agents share: PettingZoo environments."""
+"""The parts that the views of several agents share, with several learners or with one."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-from ..core import Plan, Space
+from ..core import EpisodeState, Info, Plan, Space
 from ..errors import ViewError
-from .base import View
+from .base import OneAgentView, View
 
 
 def refuse_unknown_agents(plan: Plan) -> None:
@@ -79,3 +80,28 @@ class AgentsView(View):
     def action_spaces(self) -> dict[str, Space]:
         """The action spaces of all possible agents. For errors, see ``observation_spaces``."""
         return {agent: self.action_space(agent) for agent in self.possible_agents}
+
+
+class UnitedView(OneAgentView):
+    """A view with one learner for all agents, which have united spaces."""
+
+    _own_options = ("flatten", "state_in_info")
+    _last_time: float | None = None  # the time of the previous reset or step
+    _unite: Callable[[Plan], Any]  # returns an object with both spaces
+
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the united spaces of a plan's agents."""
+        united = plan.derive(cls._unite)
+        return united.observation_space, united.action_space
+
+    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
+        return self.spaces_of(self.session.plan)
+
+    def _add_to(self, info: Info, episode: EpisodeState) -> None:
+        """Add the time since the last step, and the state, to an info."""
+        if episode.clock is not None:
+            info |= episode.clock.read(self._last_time)
+            self._last_time = info["time"]
+        if episode.plan.options.state_in_info:
+            info["state"] = self.state()

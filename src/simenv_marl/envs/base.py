@@ -214,8 +214,7 @@ class View:
     @cached_property
     def state_space(self) -> Space | None:
         """The space of ``state()``, if the environment was made with one."""
-        reader: StateReader = self.session.plan.derive(StateReader)
-        return reader.space
+        return self.session.plan.derive(StateReader).space
 
     def state(self) -> Model:
         """Return the state of the simulation, for centralised critics.
@@ -522,6 +521,11 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """The action space. No other environment shares it."""
         return self._spaces_of(self._agent_name)[1]
 
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the observation space and the action space of an adapted plan."""
+        raise NotImplementedError
+
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Prepare for a new episode; return the results of its reset."""
         raise NotImplementedError
@@ -536,6 +540,10 @@ class OneAgentView(View, gym.Env[Any, Any]):
         results = [view.read(view.episode) for view in views]
         observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
         return observations, rewards, infos
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action for the pending decision, before the simulation moves."""
+        raise NotImplementedError
 
     def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
         """Return how an episode has ended: whether terminated, whether truncated."""

@@ -1,6 +1,6 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -23,7 +23,8 @@ from ..core import (
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE, optional_method
-from .base import OneAgentView, StepResult
+from .agents import UnitedView
+from .base import StepResult
 
 
 class Joint:
@@ -99,20 +100,14 @@ class Joint:
             )
         return {name: action[name] for name in live}
 
-    def read(self, episode: EpisodeState, before: float | None) -> StepResult:
-        """Return the results of a reset or a step. ``before``: the time of the previous one.
+    def read(self, episode: EpisodeState) -> StepResult:
+        """Return the results of a reset or a step.
 
         An agent that has ended keeps its last observation. The reward is the sum of all rewards.
         """
+        agents = [episode.agents.get(name) or episode.ended[name] for name in self.roster]
         used = () if episode.round is None else episode.round.acted
-        observation, info = self.see(
-            [episode.agents.get(name) or episode.ended[name] for name in self.roster]
-        )
-        pending = episode.pending
-        info["deciding"] = "" if pending is None else pending.name
-        info["acted"] = {name: name in used for name in self.roster}
-        if episode.clock is not None:
-            info |= episode.clock.read(before)
+        observation, info = self.see(agents, episode.pending, used)
         reward = episode.earned
         if reward is None:
             reward = 0.0
@@ -120,10 +115,15 @@ class Joint:
                 reward += agent.reward
         return observation, reward, episode.terminated, episode.truncated, info
 
-    def see(self, agents: Sequence[Agent | None]) -> tuple[Observation, Info]:
-        """Return the observation of the agents of the roster, and an info with their masks.
+    def see(
+        self, agents: Sequence[Agent | None], deciding: Agent | None, acted: Collection[str]
+    ) -> tuple[Observation, Info]:
+        """Return the observation of the agents of the roster, and an info.
 
-        None in place of an agent that has not appeared.
+        Args:
+            agents: The agents. None in place of one that has not appeared.
+            deciding: The agent that decides.
+            acted: The names of the agents whose action was used.
         """
         observations = {}
         masks = {}
@@ -138,10 +138,13 @@ class Joint:
                 observations[name] = spaces.flatten(space, observations[name])
             parts = list(observations.values())
             joined = np.concatenate(parts).astype(self.observation_space.dtype)
-        return joined, {MASK: masks} if masks else {}
+        info: Info = {MASK: masks} if masks else {}
+        info["deciding"] = "" if deciding is None else deciding.name
+        info["acted"] = {name: name in acted for name in self.roster}
+        return joined, info
 
 
-class SimulationJointEnv(OneAgentView):
+class SimulationJointEnv(UnitedView):
     """A simulation as a Gymnasium environment with one agent that takes all decisions.
 
     ``joint_env`` makes it. A step is a round of the parallel view with an action for each agent.
@@ -160,9 +163,8 @@ class SimulationJointEnv(OneAgentView):
     """
 
     in_rounds = True
-    _own_options = ("flatten", "state_in_info")
     _agent_name = "joint"
-    _last_time: float | None = None  # the time of the previous reset or step
+    _unite = Joint
 
     def set_up(self) -> None:
         """Combine the agents. If a simulation announces them, reset one to find them."""
@@ -182,16 +184,7 @@ class SimulationJointEnv(OneAgentView):
             roster = {name: agent.point for name, agent in agents.items()}
             session.declare(session.plan.declared(roster))
         self._roster = session.plan.roster
-        self.joint: Joint = session.plan.derive(Joint)
-
-    @classmethod
-    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
-        """Return the combined spaces of a plan's agents."""
-        joint: Joint = plan.derive(Joint)
-        return joint.observation_space, joint.action_space
-
-    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
-        return self.spaces_of(self.session.plan)
+        self.joint = session.plan.derive(Joint)
 
     def step(self, action: Action) -> StepResult:
         """Play a round with an action for each agent.
@@ -229,11 +222,8 @@ class SimulationJointEnv(OneAgentView):
 
     def read(self, episode: EpisodeState) -> StepResult:
         """Return the results of a step."""
-        results = self.joint.read(episode, self._last_time)
-        info = results[-1]
-        self._last_time = info.get("time")
-        if self.session.plan.options.state_in_info:
-            info["state"] = self.state()
+        results = self.joint.read(episode)
+        self._add_to(results[-1], episode)
         if episode.over:
             self.warn_of_losses(episode)
         return results

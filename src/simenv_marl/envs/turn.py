@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import exp
+from functools import partial
+from operator import methodcaller
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from ..core import (
     MASK,
@@ -28,8 +30,8 @@ from ..core import (
 from ..decision import DecisionPoint
 from ..errors import ViewError, listed
 from ..simulation import RULE
-from .agents import refuse_unknown_agents
-from .base import OneAgentView, StepResult
+from .agents import UnitedView, refuse_unknown_agents
+from .base import StepResult
 
 RULE_ACTION = "rule_action"
 """The key of the rule's action in infos."""
@@ -39,13 +41,13 @@ class Seat(NamedTuple):
     """The decision point of some agents, as the learner sees it.
 
     Attributes:
-        kind: The number of the point.
-        encode: Encodes an observation of theirs. None: their space is the common one.
+        kind: The number of the point. With ``flatten=True``, as the vector of its flattened form.
+        encode: Encodes an observation of theirs. None: it is the learner's.
         code: Translates between their actions and the learner's.
         renew_mask: Makes the mask if all their actions are legal. None: nothing can be masked.
     """
 
-    kind: np.int64
+    kind: Any
     encode: Encode | None
     code: ActionCode
     renew_mask: Callable[[], Mask] | None
@@ -72,6 +74,7 @@ class Turn:
     def __init__(self, plan: Plan) -> None:
         """Unite the spaces of the active points, or raise ``ViewError`` if that is not possible."""
         options = plan.options
+        hooks = [point.hook for point in plan.active]
         definitions = [point.definition for point in plan.active]
         seen = [each.observation_space for each in definitions]
         actions = [each.action_space for each in definitions]
@@ -81,65 +84,60 @@ class Turn:
         except ViewError as error:
             raise _explained(error, plan) from None
         self.translates = any(space != self.action_space for space in actions)
-        hooks = [point.hook for point in plan.active]
-        kinds = map(np.int64, range(len(hooks)))
-        masks = [code.widen(None) for code in codes]
-        renewing = [None if mask is None else np.asarray(mask).copy for mask in masks]
-        self.seats = _Seats(zip(hooks, map(Seat, kinds, encoders, codes, renewing), strict=True))
-        parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
-        self._indices: dict[str, np.int64] = {}
-        if options.possible_agents is not None:
-            parts["agent"] = spaces.Discrete(len(plan.roster))
-            self._indices = {name: np.int64(index) for index, name in enumerate(plan.roster)}
-        self._whole = spaces.Dict(parts)
-        self._common = common
-        self.observation_space: Space = self._whole
-        self._flatten = options.flatten
-        has_more = options.flatten or options.state_in_info or options.team_reward
+        names = [] if options.possible_agents is None else list(plan.roster)
+        has_more = options.flatten or options.state_in_info or options.team_reward or names
         informs = any(each.rule_action_mapping is not None for each in definitions)
-        self.is_plain = not (has_more or informs or self._indices or any(encoders))
-        self._beginnings: dict[tuple[np.int64, str], Any] = {}
+        self.is_plain = not (has_more or informs or any(encoders))
+        parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
+        if names:
+            parts["agent"] = spaces.Discrete(len(names))
+        self.observation_space: Space = spaces.Dict(parts)
+        kinds: NDArray[Any] = np.arange(len(hooks))
+        agents: NDArray[Any] = np.arange(len(names))
+        self._flatten = options.flatten
         if options.flatten:
-            self.observation_space = spaces.flatten_space(self._whole)
+            self.observation_space = spaces.flatten_space(self.observation_space)
             if not isinstance(self.observation_space, spaces.Box):
                 problem = f"flatten=True needs observations that can be flattened, not {common}"
                 raise _explained(ViewError(problem), plan)
+            dtype = self.observation_space.dtype
+            kinds = np.eye(len(hooks), dtype=dtype)
+            agents = np.eye(len(names), dtype=dtype)
+            is_box = isinstance(common, spaces.Box)
+            flatten = methodcaller("ravel") if is_box else partial(spaces.flatten, common)
+            encoders = [encode or flatten for encode in encoders]
+        self._agents = dict(zip(names, agents, strict=True))
+        masks = [code.widen(None) for code in codes]
+        renewing = [None if mask is None else np.asarray(mask).copy for mask in masks]
+        self.seats = _Seats(zip(hooks, map(Seat, kinds, encoders, codes, renewing), strict=True))
 
     def observe(self, agent: Agent) -> Observation:
         """Return an agent's latest observation as one of the learner."""
         seat = self.seats[agent.point.hook]
-        shared: Any = agent.hand_out()
+        shared = agent.hand_out()
         if seat.encode is not None:
             shared = seat.encode(shared)
+        mark = self._agents[agent.name] if self._agents else None
         if self._flatten:
-            is_box = isinstance(self._common, spaces.Box)
-            flat: Any = shared.ravel() if is_box else spaces.flatten(self._common, shared)
-            return np.concatenate((self._beginning(agent, seat), flat))
+            parts = (seat.kind, shared)
+            return np.concatenate(parts if mark is None else (mark, *parts))
         observation = {"kind": seat.kind, "observation": shared}
-        if self._indices:
-            observation["agent"] = self._indices[agent.name]
+        if mark is not None:
+            observation["agent"] = mark
         return observation
 
     def mask(self, agent: Agent) -> Mask | None:
         """Return the mask of the learner's actions. None: nothing can be masked."""
-        return self.seats[agent.point.hook].code.widen(agent.mask)
+        seat = self.seats[agent.point.hook]
+        if agent.mask is not None:
+            return seat.code.widen(agent.mask)
+        return None if seat.renew_mask is None else seat.renew_mask()
 
     def decode(self, agent: Agent, action: Action) -> Action:
-        """Return an agent's own action for one of the learner."""
+        """Return an agent's own action for one of the learner, or ``RULE``."""
+        if action is RULE:
+            return RULE
         return self.seats[agent.point.hook].code.decode(action, agent.mask)
-
-    def _beginning(self, agent: Agent, seat: Seat) -> Any:
-        """Return the flattened agent and kind, which come before the observation."""
-        key = seat.kind, agent.name if self._indices else ""
-        if key not in self._beginnings:
-            numbers = {"kind": seat.kind}
-            if self._indices:
-                numbers["agent"] = self._indices[agent.name]
-            parts: list[Any] = [
-                spaces.flatten(self._whole[name], numbers[name]) for name in sorted(numbers)
-            ]
-            self._beginnings[key] = np.concatenate(parts).astype(self.observation_space.dtype)
-        return self._beginnings[key]
 
 
 def _explained(error: ViewError, plan: Plan) -> ViewError:
@@ -156,7 +154,7 @@ def _explained(error: ViewError, plan: Plan) -> ViewError:
     )
 
 
-class SimulationTurnEnv(OneAgentView):
+class SimulationTurnEnv(UnitedView):
     """A simulation as a Gymnasium environment of one learner that takes each decision in turn.
 
     ``turn_env`` makes it. A step answers the pending decision, and runs to the next one of any
@@ -177,17 +175,15 @@ class SimulationTurnEnv(OneAgentView):
     """
 
     own_seat: Seat
-    _own_options = ("flatten", "state_in_info")
     _agent_name = "turn"
-    _last_time: float | None = None  # the time of the previous reset or step
+    _unite = Turn
 
     def set_up(self) -> None:
         """Unite the agents."""
-        self.turn: Turn = self.session.plan.derive(Turn)
+        self.turn = self.session.plan.derive(Turn)
         episode = self.session.episode
         if episode is not None and episode.pending is not None:
-            self.own_agent = episode.pending
-            self.own_seat = self.turn.seats[episode.pending.point.hook]
+            self._face(episode.pending)
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
@@ -195,14 +191,10 @@ class SimulationTurnEnv(OneAgentView):
         refuse_unknown_agents(plan)
         return super().adapt(replace(plan, unites=True))
 
-    @classmethod
-    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
-        """Return the spaces of the learner."""
-        turn: Turn = plan.derive(Turn)
-        return turn.observation_space, turn.action_space
-
-    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
-        return self.spaces_of(self.session.plan)
+    def _face(self, agent: Agent) -> None:
+        """Note the agent that decides."""
+        self.own_agent = agent
+        self.own_seat = self.turn.seats[agent.point.hook]
 
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Return the observation and the info of a reset."""
@@ -211,8 +203,7 @@ class SimulationTurnEnv(OneAgentView):
         if agent is None:  # all moves were forced
             agents = (*episode.agents.values(), *episode.ended.values())
             agent = next(agent for agent in agents if agent.decided)
-        self.own_agent = agent
-        self.own_seat = self.turn.seats[agent.point.hook]
+        self._face(agent)
         observation, *_, info = self.read(episode, begins=True)
         return observation, info
 
@@ -234,8 +225,8 @@ class SimulationTurnEnv(OneAgentView):
         if episode is None or (self._lock and not self._lock.held):
             return self._step_in_lock(SimulationTurnEnv.step, action)
         turn = self.turn
-        if turn.translates:
-            action = self._translate(episode, action)
+        if turn.translates and episode.pending is not None:
+            action = turn.decode(episode.pending, action)
         episode.step(action)
         if self._shows:
             self.show_step()
@@ -244,7 +235,7 @@ class SimulationTurnEnv(OneAgentView):
             return self.read(episode)
         # The same as in ``read``, whose call and checks take a twentieth of a step.
         self.own_agent = agent
-        self.own_seat = seat = turn.seats[agent.point.hook]
+        seat = turn.seats[agent.point.hook]
         renew = seat.renew_mask
         info: Info = {"agent": agent.name}
         if renew is not None:
@@ -252,64 +243,43 @@ class SimulationTurnEnv(OneAgentView):
         observation = {"kind": seat.kind, "observation": agent.hand_out()}
         return observation, agent.reward, False, False, info
 
-    def _translate(self, episode: EpisodeState, action: Action) -> Action:
-        """Return the deciding agent's own action for one of the learner."""
-        agent = episode.pending
-        if agent is None or action is RULE:
-            return action
-        return self.turn.decode(agent, action)
-
     def read(self, episode: EpisodeState, *, begins: bool = False) -> StepResult:
         """Return the results of a step, or of a reset, which leaves rewards to the first step."""
         turn = self.turn
         before = self.own_agent
         seat_before = self.own_seat
         agent = episode.pending
+        ends = False, False
         if agent is None:
             agent = before
+            ends = episode.terminated, episode.truncated
             reward = sum([each.reward for each in episode.agents.values()], 0.0)
         else:
             reward = agent.reward
-            self.own_agent = agent
         if episode.just_ended and not begins:
             reward += sum([each.reward for each in episode.take_ended()])
         if episode.earned is not None:
             reward = episode.earned
-        self.own_seat = seat = turn.seats[agent.point.hook]
-        info = {**agent.info, "agent": agent.name}
-        if agent.mask is None:
-            if seat.renew_mask is not None:
-                info[MASK] = seat.renew_mask()
-        elif turn.translates:  # else the info has it
-            info[MASK] = seat.code.widen(agent.mask)
+        self.own_agent = agent
+        self.own_seat = turn.seats[agent.point.hook]
+        info = agent.info
+        info["agent"] = agent.name
+        if turn.translates or agent.mask is None:  # else the info has it
+            mask = turn.mask(agent)
+            if mask is not None:
+                info[MASK] = mask
         noted = info.pop(RULE_ACTION, None)
         if agent is not before:  # else it is of an earlier step
             noted = before.noted_action
         if noted is not None:
             info[RULE_ACTION] = seat_before.code.encode(noted)
-        if episode.clock is not None:
-            self._add_times(episode, agent, info)
-        if episode.plan.options.state_in_info:
-            info["state"] = self.state()
-        terminated, truncated = self.read_end(episode)
-        return turn.observe(agent), reward, terminated, truncated, info
-
-    def _add_times(self, episode: EpisodeState, agent: Agent, info: Info) -> None:
-        """Add the times since the last step to an agent's info."""
-        if agent is not episode.pending and episode.clock is not None:  # it may have ended earlier
-            info |= episode.clock.read(None)
-        now = info["time"]
-        info["elapsed"] = elapsed = 0.0 if self._last_time is None else now - self._last_time
-        self._last_time = now
-        rate = episode.plan.options.discount_rate
-        if rate is not None:
-            info["discount"] = exp(-rate * elapsed)
+        self._add_to(info, episode)
+        return turn.observe(agent), reward, *ends, info
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""
-        episode = self.episode
-        action = self._translate(episode, action)
-        return action if episode.pending is None else episode.pending.validate(action)
+        agent = self.episode.pending
+        return action if agent is None else agent.validate(self.turn.decode(agent, action))
 
     def masks(self) -> list[Mask]:
         """Return the mask of the deciding agent."""

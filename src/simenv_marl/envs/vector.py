@@ -41,9 +41,9 @@ from .base import OneAgentView, ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
 from .turn import SimulationTurnEnv
-from .vector_batch import Infos, SimulationBatch, StackedView, make_batch
+from .vector_batch import Infos, SimulationBatch, make_batch
 
-VIEWS: Final[Mapping[str, type[StackedView]]] = {
+VIEWS: Final[Mapping[str, type[OneAgentView]]] = {
     "single": SimulationEnv,
     "joint": SimulationJointEnv,
     "turn": SimulationTurnEnv,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -26,13 +26,8 @@ from ..core import (
 )
 from ..errors import InvalidActionError, annotate
 from ..many.batch import step_all
-from .base import ResetOptions
-from .joint import SimulationJointEnv
-from .single import SimulationEnv, plan_of
-from .turn import SimulationTurnEnv
-
-StackedView: TypeAlias = SimulationEnv | SimulationJointEnv | SimulationTurnEnv
-"""The views that can be stepped together."""
+from .base import OneAgentView, ResetOptions
+from .single import plan_of
 
 Infos = list[tuple[int, Info]]
 """Infos with the numbers of their sub-environments. They must be merged in this order."""
@@ -52,7 +47,7 @@ class SimulationBatch:
     def __init__(
         self,
         plan: Plan,
-        view: type[StackedView],
+        view: type[OneAgentView],
         space: Space,
         mode: AutoresetMode,
         part: range,
@@ -137,8 +132,7 @@ class SimulationBatch:
             if is_over:
                 self._begin(place)
         episodes = self._move(actions, ended)
-        views: Any = self.views  # all of one class
-        self._observations, earned, news = self._view.read_all(views)
+        self._observations, earned, news = self._view.read_all(self.views)
         rewards = np.array(earned, np.float64)
         if self._first is None:
             rewards[ended] = 0.0

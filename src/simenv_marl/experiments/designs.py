@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import combinations, product
 from math import ceil, prod
-from numbers import Integral
 from sys import float_info
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ..core import checked_seed, same
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
+from ..simulation import is_integer
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -141,8 +141,7 @@ def design(
             f"method must be one of {', '.join(METHODS)}, not"
             f" {short_repr(method)}{did_you_mean(method, METHODS)}"
         )
-    is_integer = isinstance(n, Integral) and not isinstance(n, bool)
-    if n is not None and not (is_integer and n > 0):
+    if n is not None and not (is_integer(n) and n > 0):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     builder = Builder(parsed_factors, None if n is None else int(n), checked_seed(seed) or 0)
     matrix = getattr(builder, method)()

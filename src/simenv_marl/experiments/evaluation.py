@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
 from math import inf, nan, sqrt
-from numbers import Real
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
@@ -17,7 +16,7 @@ from ..data.plots import interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from ..runs import check_options
-from ..simulation import Model
+from ..simulation import Model, is_number
 from .plots import LOOKS, draw_dots, label_below
 from .runner import (
     FALLBACKS,
@@ -478,8 +477,7 @@ def numbers(values: "DataFrame", metric: str) -> "DataFrame":
 
 def check_number(name: str, value: float, most: float = inf) -> None:
     """Check that an argument is a number between 0 and ``most``."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not is_number or not 0 < value < most:
+    if not is_number(value) or not 0 < value < most:
         raise OptionValueError(
             f"{name} must lie between 0 and {most}, such as 0.95, not {short_repr(value)}"
         )

@@ -212,7 +212,8 @@ class Runner:
 
         def finish(place: int, episode: Episode) -> Callable[[], None]:
             seed = seeds[place]
-            outcome = replace(tally.outcomes.pop(seed), team=episode.total)
+            team = None if episode.team is None else episode.team.total
+            outcome = replace(tally.outcomes.pop(seed), team=team)
             if episode.fault:
                 return partial(report, seed, f"the numbers are wrong: {episode.fault}")
             if TEAM in outcome.agents:

@@ -33,7 +33,6 @@ from ..core import (
     Info,
     Plan,
     Point,
-    Policy,
     Session,
     UnmatchedNames,
     close_all,
@@ -93,8 +92,8 @@ class BatchPolicy:
         infos: Sequence[Info],
         identities: Sequence[object],
         states: object,
-    ) -> Action:
-        """Call the policy with as many of the arguments as it takes, and return its result.
+    ) -> Answers:
+        """Call the policy with as many of the arguments as it takes, and return its answers.
 
         Args:
             observations: Stacked observations, of shape ``(batch, *shape)``.
@@ -103,7 +102,9 @@ class BatchPolicy:
             states: The stacked states, if it takes them.
         """
         seen = (observations, infos, identities)[: self._places]
-        return self.policy(*seen, _state=states) if self.takes_state else self.policy(*seen)
+        asked = {"_state": states} if self.takes_state else {}
+        answers = self.policy(*seen, **asked)
+        return read_answers(answers, self if self.keys else self.policy, len(infos))
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
@@ -137,6 +138,8 @@ class PolicyKey(DeferredPolicy):
         if isinstance(policy, EpisodePolicy):
             self.looks_back = policy.looks_back
             self.sees_all = policy.sees_all
+            self.plans = policy.plans
+            self.asks = policy.asks
 
     def answer(
         self,
@@ -156,14 +159,6 @@ class PolicyKey(DeferredPolicy):
         return actions[0]
 
 
-class AskingKey(AskingPolicy, PolicyKey):
-    """The key of a policy that answers one decision at a time, because of its parameters."""
-
-    def __init__(self, place: int, batch_policy: BatchPolicy, policy: Policy) -> None:
-        AskingPolicy.__init__(self, policy)
-        PolicyKey.__init__(self, place, batch_policy)
-
-
 def policy_keys(policies: Mapping[Any, Any], *, alone: bool = False) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
@@ -179,8 +174,6 @@ def policy_keys(policies: Mapping[Any, Any], *, alone: bool = False) -> dict[Any
         batch_policy = batch_policies.setdefault(id(policy), BatchPolicy(policy, alone=alone))
         batch_policy.keys.append(key)
         keys[key] = PolicyKey(place, batch_policy)
-        if is_asked_alone(policy):
-            keys[key] = AskingKey(place, batch_policy, policy)
     return keys
 
 
@@ -231,14 +224,11 @@ class Group:
         try:
             states = None
             if policy.takes_state:
-                states = stacked([episode.note_states().read() for episode in episodes])
+                states = stacked([episode.note_state() for episode in episodes])
             if isinstance(policy.policy, EpisodePolicy):
                 agents = [episode.deciding for episode in episodes]
-                answers = policy.policy.respond_to_many(agents, infos, states)
-            else:
-                stack = self.stack(observations)
-                answers = policy.answers(stack, infos, identities, states)
-            return read_answers(answers, policy, number)
+                return policy.policy.respond_to_many(agents, infos, states)
+            return policy.answers(self.stack(observations), infos, identities, states)
         except BaseException as error:
             noun = "seed" if number == 1 else "seeds"
             seeds = listed([str(episode.seed) for episode in episodes])
@@ -403,9 +393,10 @@ class BatchRun:
                 self._groups[group] = None
                 return
             arguments = episode, agent, duplicate(agent.raw_observation), agent.take_info()
-            if isinstance(key, AskingKey) and key.waits:
+            policy = key.batch_policy.policy
+            if isinstance(policy, AskingPolicy) and policy.waits:
                 self._crowd = min(self.size, max(self._crowd, self.concurrency))
-                self._backlog.append((place, episode, partial(key.begin, *arguments)))
+                self._backlog.append((place, episode, partial(policy.begin, *arguments)))
                 return
             self._step(place, episode, partial(key.answer, *arguments))
 

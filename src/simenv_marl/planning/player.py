@@ -327,7 +327,7 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
-        observation = self.view.joint.read(self.episode, None)[0]
+        observation = self.view.joint.read(self.episode)[0]
         self.latest = {self.name: (observation, {})}
         space = self.view.action_space
         policy = self._everyone

@@ -20,7 +20,6 @@ import numpy as np
 
 from ..core import (
     Agent,
-    AskingPolicy,
     Info,
     Policy,
     branch,
@@ -353,7 +352,7 @@ class Rollouts:
         agent = player.agent
         self._entropy = [
             episode.seed,
-            agent.answered if isinstance(agent.policy, AskingPolicy) else episode.turns,
+            agent.answered if getattr(agent.policy, "plans", False) else episode.turns,
             crc32(player.name.encode(errors="surrogatepass")),
             _KEY,
         ]

@@ -166,8 +166,7 @@ class FallbackPolicy(PolicyWrapper):
                 note("retried")
             try:
                 answer = await self._ask_in_time(*arguments)
-                outcome = outcome_of(answer, decision)
-                return outcome._replace(why=why, counts=counts)
+                return outcome_of(answer, decision, why=why, counts=counts)
             except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
             except Exception as error:
@@ -177,7 +176,7 @@ class FallbackPolicy(PolicyWrapper):
         answer = self._ask_fallback(*arguments)
         if isawaitable(answer):
             answer = await answer
-        return outcome_of(answer, decision)._replace(by="fallback", why=why, counts=counts)
+        return outcome_of(answer, decision, by="fallback", why=why, counts=counts)
 
     async def _ask_in_time(self, *arguments: Any) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""

@@ -201,8 +201,8 @@ class Recording:
         )
 
 
-def outcome_of(answer: Action, decision: Decision) -> Outcome:
-    """Return the outcome of a policy's answer.
+def outcome_of(answer: Action, decision: Decision, **parts: Any) -> Outcome:
+    """Return the outcome of a policy's answer, with its other parts.
 
     Raises:
         InvalidActionError: The answer is not legal.
@@ -210,7 +210,7 @@ def outcome_of(answer: Action, decision: Decision) -> Outcome:
     action, extras = split_extras(answer, decision.action_space)
     if action is not RULE:
         action = decision.validate(action)
-    return Outcome(action, extras)
+    return Outcome(action, extras, **parts)
 
 
 def question_of(decision: Decision, policy: object) -> Question:

@@ -30,7 +30,6 @@ from textwrap import shorten
 from types import FrameType, coroutine
 from typing import Any, Final, NoReturn
 
-import numpy as np
 from greenlet import getcurrent
 
 from ..core import (
@@ -130,12 +129,6 @@ _GENERATORS: Final = {"random": "Python's random", "numpy.random": "numpy.random
 """The names of global generators in findings."""
 
 
-def seed_global_generators(seed: int) -> None:
-    """Seed Python's and NumPy's global generators, to compare runs that draw from them."""
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-
-
 @contextmanager
 def silence() -> Iterator[list[warnings.WarningMessage]]:
     """Silence a model, and restore the global generators at the end.
@@ -213,7 +206,7 @@ class Run:
 
         The global generators are seeded first.
         """
-        seed_global_generators(seed)
+        GlobalRandom.begin(seed)
         states = global_states()
         try:
             call_within(seconds, function)

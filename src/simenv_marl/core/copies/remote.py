@@ -9,7 +9,7 @@ import copy
 from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ...errors import (
     BranchError,
@@ -26,8 +26,7 @@ from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
 from ..episodes.episode import Episode
 from ..episodes.events import PointHandler
 from ..episodes.session import Session
-from ..episodes.state import EpisodeState, Outcome, State
-from ..episodes.steps import Round
+from ..episodes.state import EpisodeState, State
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection
@@ -47,26 +46,27 @@ FIELDS: Final = (
 
 _fields: Final = attrgetter(*FIELDS)
 
+STATE: Final = ("outcome", "turns", "round", "earned", "unreported_end")
+"""The fields of an episode that a mirror takes over as they are."""
+
+_state: Final = attrgetter(*STATE)
+
 
 class Report(NamedTuple):
     """The state of an episode after a request, as far as views read it.
 
     Attributes:
         is_whole: Whether it has all agents, or only the changed ones.
-        round: The present round. None where it is played in turns.
+        state: The values of ``STATE``.
         time: The simulation's time. None if it has none.
         agents: For each agent its name, the number of its point, and its ``FIELDS``.
     """
 
     is_whole: bool
-    outcome: Outcome
-    turns: int
-    round: Round | None
+    state: tuple[Any, ...]
     time: float | None
     agents: list[tuple[str, int, tuple[Any, ...]]]
     pending: str | None
-    earned: float | None
-    unreported_end: bool
 
 
 class Mirror(EpisodeState):
@@ -87,11 +87,8 @@ class Mirror(EpisodeState):
 
     def load(self, report: Report) -> None:
         """Take over a report."""
-        self.unreported_end = report.unreported_end
-        self.outcome = report.outcome
-        self.turns = report.turns
-        self.earned = report.earned
-        self.round = report.round
+        for name, value in zip(STATE, report.state, strict=True):
+            setattr(self, name, value)
         self._time[0] = report.time
         self.just_ended = []
         for name, point, fields in report.agents:
@@ -126,31 +123,11 @@ class Mirror(EpisodeState):
 # -- the clone's process ---------------------------------------------------------------------------
 
 
-class HostedView(Protocol):
-    """A view in the process of a clone."""
-
-    @property
-    def episode(self) -> Episode:
-        """The episode."""
-
-    @property
-    def session(self) -> Session:
-        """The session."""
-
-    def begin_branch(self) -> None:
-        """Prepare the view of a branch."""
-
-    def export_state(self) -> dict[str, Any]:
-        """Return the state of the view."""
-
-    def import_state(self, state: dict[str, Any]) -> None:
-        """Take over the state of its twin."""
-
-
 class Host:
     """The environment in the process of a clone. Its methods answer requests."""
 
-    def __init__(self, view: HostedView) -> None:
+    def __init__(self, view: Model) -> None:
+        """Serve an unwrapped view."""
         self._view = view
         self._reported: Episode | None = None  # all its agents were reported
         self._latest: Agent | None = None  # was pending at the latest report
@@ -186,14 +163,10 @@ class Host:
         hooks = [point.hook for point in episode.plan.points]
         return Report(
             is_whole,
-            episode.outcome,
-            episode.turns,
-            episode.round,
+            _state(episode),
             None if episode.clock is None else float(episode.clock.time()),
             [(agent.name, hooks.index(agent.point.hook), _fields(agent)) for agent in agents],
             None if pending is None else pending.name,
-            episode.earned,
-            episode.unreported_end,
         )
 
     # -- requests that move the simulation: ``move`` calls them ------------------------------------

@@ -128,6 +128,7 @@ class Agent:
         now: The time of the latest decision.
         counts: The numbers that policies have counted in its decisions, by name.
         fault: Why its rewards are wrong. Empty as far as is known.
+        applying: How many of its calls of ``apply`` run, on the simulation's side.
     """
 
     name: str
@@ -160,7 +161,7 @@ class Agent:
     now: float | None = None
     counts: dict[str, float] = field(default_factory=dict)
     fault: str = ""
-    _applying: int = 0
+    applying: int = 0
 
     def __post_init__(self) -> None:
         self.point = self.handler.point
@@ -182,7 +183,7 @@ class Agent:
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision. Return this agent if it waits for the user, else the reply."""
-        if self._applying:
+        if self.applying:
             return RULE
         if self.delegated:
             return episode.ask(self, args, kwargs)
@@ -265,8 +266,13 @@ class Agent:
         """
         point = self.point
         reply: Model = action
-        if self.choices is not None:
-            reply = self._take_choice(action, self.choices)
+        choices = self.choices
+        if choices is not None:
+            self.choices = None  # the others are forgotten
+            if point.reports_rule:
+                self.offered = [weaken(choice) for choice in choices]
+            if action is not RULE:
+                reply = [choices[action]]
         elif action is not RULE:
             convert = point.convert
             reply = convert(action)
@@ -287,25 +293,13 @@ class Agent:
         self.carry_reward(forced is not None or not self.asked)
         return self if forced is None else self.reply_to(forced, forced=True)
 
-    def _take_choice(self, action: Action, choices: list[Model]) -> Model:
-        """Return the choice of an action in a list, and forget the others."""
-        self.choices = None
-        if self.point.reports_rule:
-            self.offered = [weaken(choice) for choice in choices]
-        return action if action is RULE else [choices[action]]
-
     def begin_apply(self) -> None:
         """Let the agent's calls run the rule, on the simulation's side."""
-        self._applying += 1
-
-    @property
-    def is_applying(self) -> bool:
-        """Whether its ``apply`` runs, on the simulation's side."""
-        return self._applying > 0
+        self.applying += 1
 
     def end_apply(self) -> None:
         """Undo ``begin_apply``."""
-        self._applying -= 1
+        self.applying -= 1
 
     def count(self, **numbers: float) -> None:
         """Add numbers to its counts."""

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -28,7 +28,6 @@ from ..plans.point import Point, Policy, Space
 from ..plans.points import resolve_roster
 from ..plans.policies import Where
 from ..switching.context import ExclusiveLock, environment_context
-from ..switching.driver import WAIT
 from ..switching.generators import is_seed
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
@@ -81,15 +80,8 @@ LONGEST_TAPE: Final = 200_000
 """The number of answers that are kept for a replay. It limits the memory of endless simulations."""
 
 
-class Replay:
-    """A policy that repeats the answers of another episode, in place of all other policies."""
-
-    def __init__(self, answers: Iterable[Action]) -> None:
-        self.answers = deque(answers)
-
-    def answer(self) -> Action:
-        """Return the next answer. ``WAIT`` where the other episode stands."""
-        return self.answers.popleft() if self.answers else WAIT
+Replay: TypeAlias = deque[Action]
+"""The answers of another episode that are not repeated yet. They replace those of all policies."""
 
 
 class EpisodeOwner(Protocol):
@@ -215,8 +207,7 @@ class BaseSession(ABC):
 
     def read_state(self) -> Model:
         """Return the state of the simulation: see ``StateReader``."""
-        reader: StateReader = self.plan.derive(StateReader)
-        return reader.read(self)
+        return self.plan.derive(StateReader).read(self)
 
     def declare(self, plan: Plan) -> None:
         """Forget the episode that has shown the agents, and take over a plan that declares them."""

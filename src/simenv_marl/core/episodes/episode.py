@@ -40,7 +40,6 @@ from ...hooks.stacks import EVALUATING
 from ...simulation import EVERYONE, RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
-    AskingPolicy,
     DeferredPolicy,
     EpisodePolicy,
     Where,
@@ -48,7 +47,6 @@ from ..plans.policies import (
     split_extras,
     two_arguments,
 )
-from ..switching.context import environment_context
 from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
@@ -56,7 +54,7 @@ from .agent import Agent, Clock, DecisionHandler
 from .base import LONGEST_TAPE, EpisodeOwner, Replay
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
-from .steps import Round, StateNotes, Team
+from .steps import Round, Team
 
 
 class Episode(EpisodeState):
@@ -65,23 +63,25 @@ class Episode(EpisodeState):
     Attributes:
         session: Returns the session. None if that is gone.
         simulation: The simulation.
+        context: Makes the context that the environment's code needs.
         driver: The driver of its stack.
+        team: The team, with ``team_reward=``. None without.
         latest: The agent that decided last, for the notes of errors.
         called: The functions that end agents and were called.
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
         memory: The values of policies for all agents.
         moved: The names of agents that have decided at several points.
-        states: The states that learners have asked for. None if none has.
+        end_states: The states at the ends of agents midway. None if no learner has asked for any.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
-        replay: The policy that repeats another episode. None in ordinary episodes.
+        replay: The answers of the episode that this one repeats. None in ordinary episodes.
     """
 
     __slots__ = (
-        "_context", "_expected_calls", "_failed_in_model", "_handlers", "_most_steps",
-        "_observes", "_plugins", "_split", "_tape_size", "_team", "called", "driver",
-        "is_plain", "latest", "memory", "moved", "replay", "running", "session", "simulation",
-        "states", "tape",
+        "_expected_calls", "_failed_in_model", "_handlers", "_latest_state", "_most_steps",
+        "_observes", "_plugins", "_split", "_tape_size", "called", "context", "driver",
+        "end_states", "is_plain", "latest", "memory", "moved", "replay", "running", "session",
+        "simulation", "tape", "team",
     )  # fmt: skip
 
     def __init__(
@@ -102,7 +102,7 @@ class Episode(EpisodeState):
         self.simulation = simulation
         self.driver = driver
         self._expected_calls = optional_method(simulation, "expected_calls", "point")
-        self._context = session.context
+        self.context = partial(session.context, driver)
         self._handlers = session.handlers
         self._plugins = plan.plugins
         self.latest: Agent | None = None
@@ -112,22 +112,19 @@ class Episode(EpisodeState):
         self._most_steps = plan.options.max_steps or maxsize
         self.memory: dict[object, Any] = {}
         self.moved: set[str] = set()
-        self._team: Team | None = None
+        self.team: Team | None = None
         if plan.options.team_reward is not None:
-            self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
-        self.is_plain = not (in_rounds or self.skips or self._team)
+            self.team = Team(partial(plan.options.team_reward, simulation), self._plugins)
+        self.is_plain = not (in_rounds or self.skips or self.team)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
         self._observes = isinstance(plan.options.state_space, str)  # observations are states
-        self.states: StateNotes | None = None
+        self.end_states: dict[Agent, Model] | None = None
+        self._latest_state: tuple[int, Model] = (-1, None)  # the turn, and the state
         for name, prepared in self._handlers.roster.items():
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
-
-    def context(self) -> environment_context:
-        """Return the context that the environment's code needs."""
-        return self._context(self.driver)
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -233,8 +230,6 @@ class Episode(EpisodeState):
                 played.note_stalled(pending)
             else:
                 self.advance(reply)
-                if played.stalled:
-                    played.note_moved()
             if played.actions and not self.skips:  # else forced moves have used none
                 played.count_unused()
             # ``consulted`` is set where a replay ends.
@@ -297,11 +292,11 @@ class Episode(EpisodeState):
         if self.skips:
             reply = agent.reply_if_forced()
             if reply is not agent:
-                if self._team is not None:
-                    self._team.join(agent)
+                if self.team is not None:
+                    self.team.join(agent)
                 return reply
-        if self._team is not None:
-            self.earned = self._team.settle([agent])
+        if self.team is not None:
+            self.earned = self.team.settle([agent])
         return agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
@@ -315,8 +310,8 @@ class Episode(EpisodeState):
             self.note_first_decision()
             args, kwargs = agent.arguments.recall()
             agent.update(args, kwargs, observe=False)
-            if self._team is not None:
-                self._team.join(agent)
+            if self.team is not None:
+                self.team.join(agent)
         return agent.reply_to(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
@@ -351,7 +346,7 @@ class Episode(EpisodeState):
         if policy is RULE:
             return RULE
         self.latest = agent
-        is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
+        is_rewarded = isinstance(policy, EpisodePolicy) and policy.asks
         agent.update(args, kwargs, reward=is_rewarded)
         if self.skips:
             reply = agent.reply_if_forced()
@@ -369,10 +364,10 @@ class Episode(EpisodeState):
     def _consult(self, agent: Agent, policy: Policy) -> Action:
         """Call the policy of an agent. ``WAIT`` where a replay ends."""
         if self.replay is not None:
-            action = self.replay.answer()
-            if action is WAIT:
+            if not self.replay:  # the other episode stands here
                 self.consulted = self.pending = agent
                 return WAIT
+            action = self.replay.popleft()
         else:
             self.consulted = agent
             observation = duplicate(agent.raw_observation)  # which the policy may change
@@ -408,8 +403,6 @@ class Episode(EpisodeState):
         """Make the environment that a planner gets."""
         return self.plan.subject.planner_view(self.session())
 
-    # -- calls that are split ---------------------------------------------------------------------
-
     def begin_split(self, call: SplitCall) -> None:
         """Decide the items of a call, before the simulation moves."""
         self._split = call
@@ -437,7 +430,7 @@ class Episode(EpisodeState):
             raise AgentError(
                 f"agent= of {here} must return a string or None, not {short_repr(name)}"
             )
-        agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
+        agent = self.find(name)
         if agent is None:
             policy = self.plan.policy_of(name, handler.point)
             delegated = self.plan.is_delegated(policy)
@@ -493,8 +486,8 @@ class Episode(EpisodeState):
                 agent.carry_reward(not self.turns)
             if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
-        if in_rounds and self._team is not None:
-            self.earned = self._team.settle(self.agents.values())
+        if in_rounds and self.team is not None:
+            self.earned = self.team.settle(self.agents.values())
         self.pending = pending
         self.latest = pending or self.latest
 
@@ -530,29 +523,36 @@ class Episode(EpisodeState):
         An agent that a policy answers is observed for the last time, if others see that.
         """
         is_other = agent.delegated
-        policy = agent.policy
-        is_seen = self._observes or (isinstance(policy, EpisodePolicy) and policy.sees_all)
+        is_seen = self._observes or getattr(agent.policy, "sees_all", False)
         if is_other and not is_seen:
             return
         latest = self.latest
         self.latest = agent
         agent.conclude()
-        if self.states is not None:
-            self.states.note_end(agent)
+        if self.end_states is not None:
+            self.end_states[agent] = self.read_state()
         self.latest = latest  # the model continues after the decision of this agent
         if is_other:
             return
         agent.end()
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
-        if self._team is not None:
-            self._team.note_end(agent)
+        if self.team is not None:
+            self.team.note_end(agent)
 
-    def note_states(self) -> StateNotes:
-        """Return the states that learners ask for, and note further ones."""
-        if self.states is None:
-            self.states = StateNotes(self)
-        return self.states
+    def note_state(self) -> Model:
+        """Return the state, which is read once a turn. Note it at ends of agents from now on."""
+        if self.end_states is None:
+            self.end_states = {}
+        if self.is_branch:  # policies answer here, and ``turns`` stays
+            return self.read_state()
+        if self._latest_state[0] != self.turns:
+            try:
+                self._latest_state = self.turns, self.read_state()
+            except BaseException as error:
+                self.annotate(error)
+                raise
+        return self._latest_state[1]
 
     def read_state(self) -> Model:
         """Return the state of the simulation: see ``StateReader``."""
@@ -576,20 +576,19 @@ class Episode(EpisodeState):
         self.just_ended = []
         agent.take_over()
         self.round = None  # it is played in turns from now on
-        self.is_plain = not (self.skips or self._team)
+        self.is_plain = not (self.skips or self.team)
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
-            args, kwargs = agent.arguments.recall()
             with self.context():
-                agent.update(args, kwargs, observe=False)
+                agent.update(*agent.arguments.recall(), observe=False)
         self.consulted = None
         self.pending = agent
 
     def delegate(self, policies: Mapping[str, Policy]) -> None:
         """In a branch, let policies answer for the agents that follow the rule."""
-        substitutes: dict[Any, Policy] = {}
-        for name in policies.keys() - self.agents.keys():
-            policy = policy_for(policies, name, self.where)
-            substitutes[name] = policy if policy is RULE else two_arguments(policy)
+        names = policies.keys() - self.agents.keys()
+        substitutes: dict[Any, Policy] = {
+            name: two_arguments(policy_for(policies, name, self.where)) for name in names
+        }
         self.plan = self.plan.with_policies(substitutes)
         for name, agent in self.others.items():
             substitute = substitutes.get(name, substitutes.get(EVERYONE, RULE))
@@ -616,9 +615,8 @@ class Episode(EpisodeState):
         for agent in self.agents.values():
             self.latest = agent
             agent.conclude()
-        if self._team is not None:
-            self.earned = self._team.settle(self.agents.values())
-            self.total = self._team.total
+        if self.team is not None:
+            self.earned = self.team.settle(self.agents.values())
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
         session = self.session()
         if session is not None and (self.plan.named_agents or self.plan.removers):
@@ -648,10 +646,8 @@ class Episode(EpisodeState):
         except Warning as warning:  # warnings may be errors; this one must not replace the error
             problems = [warning]
         for problem in problems:
-            annotate(
-                error,
-                f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well",
-            )
+            also = f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well"
+            annotate(error, also)
         clear_frames(error)
 
     def is_suspended(self) -> bool:

@@ -189,23 +189,18 @@ class RuleHandler(Observer):
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
         """Note the actions for decisions. ``args``: each, with the arguments of its call."""
-        for decision, call_args, call_kwargs in args:
-            self._note(episode, decision, call_args, call_kwargs)
-
-    def _note(self, episode: RunningEpisode, decision: Model, args: Args, kwargs: Kwargs) -> None:
         point = self._point
-        name = point.agent or point.name_agent(*args, **kwargs)
-        agent = None
-        if type(name) is str:
-            agent = episode.agents.get(name) or episode.others.get(name)
-        if agent is None or agent.point is not point:
-            return
-        if agent.is_applying:  # its own ``apply`` runs the rule
-            return
-        episode.blame(agent)
-        action = self._action(decision, args, kwargs, agent)
-        informs = point.definition.rule_action_mapping is not None and action is not None
-        agent.note_rule_action(action, informs)
+        for decision, call_args, call_kwargs in args:
+            name = point.agent or point.name_agent(*call_args, **call_kwargs)
+            agent = None
+            if type(name) is str:
+                agent = episode.agents.get(name) or episode.others.get(name)
+            # Not while its own ``apply`` runs the rule.
+            if agent is not None and agent.point is point and not agent.applying:
+                episode.blame(agent)
+                action = self._action(decision, call_args, call_kwargs, agent)
+                informs = point.definition.rule_action_mapping is not None and action is not None
+                agent.note_rule_action(action, informs)
 
     def _action(self, decision: Model, args: Args, kwargs: Kwargs, agent: Agent) -> Action:
         """Return the action that corresponds to a decision. None if no action does."""
@@ -274,8 +269,7 @@ def handlers_of(plan: Plan, simulation: Model) -> Handlers:
     """
     if any(point.needs_simulation for point in plan.points):
         return _make_handlers(plan, simulation)
-    handlers: Handlers = plan.derive(_make_handlers)
-    return handlers
+    return plan.derive(_make_handlers)
 
 
 def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:

@@ -164,7 +164,12 @@ class Session(BaseSession):
                 self.seed = self.seed_for(seed)
                 more: list[int] | None = None
                 while True:
-                    self._enter_ready_driver(driver)
+                    self._driver = self._driver.ready()
+                    if self._driver is not driver:
+                        self._driver.enter(direct=self._rng is None)
+                    if self._driver.stale:  # code that still uses it must not meet another episode
+                        self._make_simulation()
+                        self._driver.renew()
                     try:
                         return self._begin(self.seed, in_rounds, replay, beside)
                     except NoDecisionError:
@@ -197,15 +202,6 @@ class Session(BaseSession):
         if getattr(simulation, "deterministic", False):
             return []
         return list(map(int, np.random.SeedSequence(seed).generate_state(MOST_SEEDS - 1)))
-
-    def _enter_ready_driver(self, entered: Driver) -> None:
-        """Replace the driver if it cannot run another job. ``entered``: the context's driver."""
-        self._driver = driver = self._driver.ready()
-        if driver is not entered:
-            driver.enter(direct=self._rng is None)
-        if driver.stale:  # code that still uses it must not meet another episode
-            self._make_simulation()
-            driver.renew()
 
     def _begin(
         self, seed: int, in_rounds: bool, replay: Replay | None, beside: bool | None
@@ -381,8 +377,8 @@ class Session(BaseSession):
         episode = self.start(
             recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
         )
-        while replay.answers:
-            answer = replay.answer()
+        while replay:
+            answer = replay.popleft()
             if isinstance(answer, _Reseeded):
                 self.reseed(answer.seed)
             else:

@@ -173,14 +173,13 @@ class EpisodeState:
         turns: The number of actions that the environment's user has given.
         round: The present round. None if the episode is played in turns.
         earned: The team's reward of the latest step. None if each agent has its own rewards.
-        total: The team's rewards of the whole episode, at its end. None as in ``earned``.
         skips: Whether a decision with one legal action is answered with it.
         where: Where it is played, which determines the policies that are asked.
     """
 
     __slots__ = (
         "_deciders", "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined",
-        "just_ended", "others", "outcome", "pending", "plan", "round", "seed", "skips", "total",
+        "just_ended", "others", "outcome", "pending", "plan", "round", "seed", "skips",
         "turns", "unreported_end", "where",
     )  # fmt: skip
 
@@ -201,7 +200,6 @@ class EpisodeState:
         self.pending: Agent | None = None
         self.consulted: Agent | None = None
         self.outcome = RUNNING
-        self.total: float | None = None
         self.has_joined = False
         self._deciders = 0
         self.unreported_end = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from ...errors import short_repr, warn_user
 from ...hooks.stacks import outside_simulation
@@ -43,11 +43,6 @@ class Round:
         self.stalled = 0
         self._pending = ""  # the agent whose decision waited when the round began
 
-    @property
-    def given(self) -> int:
-        """The number of actions in the episode, other than ``RULE``."""
-        return self.used + self.unused
-
     def begin(self, actions: dict[str, Action], pending: str) -> None:
         """Begin a round with checked actions. ``pending``: the agent whose decision waits."""
         self.actions = actions
@@ -67,6 +62,7 @@ class Round:
             self.used += 1
             self.early += agent.name != self._pending
         self.acted.add(agent.name)
+        self.stalled = 0
         return action
 
     def count_unused(self) -> None:
@@ -76,18 +72,15 @@ class Round:
 
     def explain_losses(self) -> str:
         """Explain how many actions were lost. Empty if at least nine in ten were used."""
-        if 10 * self.used >= 9 * self.given:
+        given = self.used + self.unused
+        if 10 * self.used >= 9 * given:
             return ""
         return (
-            f"of {self.given} actions in this episode, {self.used} were used: the agents do not"
+            f"of {given} actions in this episode, {self.used} were used: the agents do not"
             " decide in each round, and the other actions are lost;"
             f" {self.early} decisions were answered by an action that was chosen before they"
             " arose. aec_env loses none, nor does turn_env, for one learner"
         )
-
-    def note_moved(self) -> None:
-        """Note that the simulation has moved."""
-        self.stalled = 0
 
     def note_stalled(self, pending: Agent) -> None:
         """Note that the simulation has not moved. Warn if that is so for many rounds."""
@@ -100,33 +93,16 @@ class Round:
             )
 
 
-class NotedEpisode(Protocol):
-    """An episode whose states are noted."""
-
-    turns: int
-
-    @property
-    def is_branch(self) -> bool:
-        """Whether it is a branch that a policy has made of its environment."""
-
-    def read_state(self) -> Model:
-        """Return the state of the simulation."""
-
-    def annotate(self, error: BaseException) -> None:
-        """Add a note to an error: the decision and the agent where it arose."""
-
-
 class Team:
     """The team of an episode.
 
     Attributes:
-        earned: What the team has earned in the latest step. 0.0 at the reset.
         total: What it has earned since the first decision.
         plugins: The handlers that take part in its callable.
         memory: The values of differences in its callable.
     """
 
-    __slots__ = ("_earn", "_ended", "_has_begun", "_paid", "earned", "memory", "plugins", "total")
+    __slots__ = ("_earn", "_ended", "_has_begun", "_paid", "memory", "plugins", "total")
 
     def __init__(self, earn: Callable[[], Model], plugins: Plugins | None) -> None:
         """Begin without any reward. ``earn`` returns what was earned since it was last called."""
@@ -134,7 +110,6 @@ class Team:
         self._ended: list[Agent] = []  # in this step
         self._has_begun = False
         self._paid: dict[str, float] = {}  # the total at each agent's latest reward
-        self.earned = 0.0
         self.total = 0.0
         self.plugins = plugins
         self.memory: dict[Any, Any] = {}
@@ -155,43 +130,13 @@ class Team:
         """
         with outside_simulation(self):
             earned = checked_reward("the team", self._earn())
-        if self._has_begun:
-            self.earned = earned
-            self.total += earned
+        if not self._has_begun:
+            earned = 0.0
         self._has_begun = True
+        self.total += earned
         for agent in (*self._ended, *agents):
             if agent.decided:
                 agent.pay(self.total - self._paid.get(agent.name, self.total))
                 self._paid[agent.name] = self.total
         self._ended = []
-        return self.earned
-
-
-class StateNotes:
-    """The states of an episode that learners ask for. Each is read once.
-
-    Attributes:
-        ends: The state at the end of each agent that has ended midway, until it is taken.
-    """
-
-    def __init__(self, episode: NotedEpisode) -> None:
-        self._episode = episode
-        self._latest: tuple[int, Model] | None = None  # the turn, and the state
-        self.ends: dict[Agent, Model] = {}
-
-    def read(self) -> Model:
-        """Return the state at the pending decision, or at the end."""
-        episode = self._episode
-        if episode.is_branch:  # policies answer here, and ``turns`` stays
-            return episode.read_state()
-        if self._latest is None or self._latest[0] != episode.turns:
-            try:
-                self._latest = episode.turns, episode.read_state()
-            except BaseException as error:
-                episode.annotate(error)
-                raise
-        return self._latest[1]
-
-    def note_end(self, agent: Agent) -> None:
-        """Note the state at the end of an agent."""
-        self.ends[agent] = self._episode.read_state()
+        return earned

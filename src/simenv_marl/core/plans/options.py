@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from inspect import cleandoc
 from itertools import chain
 from math import inf
-from numbers import Real
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
 from gymnasium.spaces import Space
 
 from ...errors import OptionValueError, UnknownOptionError, did_you_mean, short_repr
-from ...simulation import RULE, is_integer
+from ...simulation import RULE, is_integer, is_number
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -93,7 +92,7 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         "the name of an agent or None",
     ),
     "discount_rate": (
-        lambda rate: isinstance(rate, Real) and not _is_bool(rate) and 0 <= float(rate) < inf,
+        lambda rate: is_number(rate) and 0 <= float(rate) < inf,
         "a finite number that is not negative, or None",
     ),
     "clip_actions": (

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 from itertools import chain
-from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, cast
+from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, TypeVar, cast
 from weakref import finalize
 
 from ...decision import DecisionPoint, Definition
@@ -57,7 +57,7 @@ from .points import (
     resolve_policies,
     resolve_roster,
 )
-from .policies import AskingPolicy, DeferredPolicy
+from .policies import DeferredPolicy, EpisodePolicy
 
 DRIVERS: Final[Mapping[str, type[Driver]]] = {
     "greenlet": GreenletDriver,
@@ -66,6 +66,8 @@ DRIVERS: Final[Mapping[str, type[Driver]]] = {
 
 Source: TypeAlias = "Model | type | Callable[[], Model]"
 """A simulation, its class, a zero-argument factory, or a ``Variant``."""
+
+Derived = TypeVar("Derived")
 
 PlannerView: TypeAlias = "Callable[[Any], object]"
 """Makes, from a session, the environment that a planner gets."""
@@ -244,11 +246,12 @@ class Plan:
 
     _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
 
-    def derive(self, function: Callable[[Plan], Model]) -> Model:
+    def derive(self, function: Callable[[Plan], Derived]) -> Derived:
         """Call a function of the plan once, and return its result each time."""
         if function not in self._derived:
             self._derived[function] = function(self)
-        return self._derived[function]
+        derived: Derived = self._derived[function]
+        return derived
 
     @property
     def has_user(self) -> bool:
@@ -501,7 +504,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         policies=by_agent,
         everyone=everyone,
         has_planner=any(
-            isinstance(policy, AskingPolicy) and policy.plans
+            isinstance(policy, EpisodePolicy) and policy.plans
             for policy in (*by_point.values(), *by_agent.values())
         ),
         has_split=any(point.split is not None for point in points),

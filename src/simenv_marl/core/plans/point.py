@@ -227,13 +227,11 @@ class Point:
 
     def has_spaces_of(self, other: Point) -> bool:
         """Return whether another point has the same spaces."""
-        mine = self.definition
-        its = other.definition
-        pairs = (
-            (mine.observation_space, its.observation_space),
-            (mine.action_space, its.action_space),
+        mine, its = (
+            (point.definition.observation_space, point.definition.action_space)
+            for point in (self, other)
         )
-        return all(one is two or one == two for one, two in pairs)
+        return mine == its
 
     def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
         """Make a function callable with all arguments of a call, as ``adapt`` does."""

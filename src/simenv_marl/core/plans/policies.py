@@ -121,9 +121,9 @@ def takes_state(policy: Policy) -> bool:
     return told if isinstance(told, bool) else asks_for(policy, ASKED[-1])
 
 
-def two_arguments(policy: Callable[..., Action]) -> Callable[[Observation, Info], Action]:
-    """Make a policy callable with observation and info."""
-    if isinstance(policy, EpisodePolicy):
+def two_arguments(policy: Policy) -> Policy:
+    """Make a policy callable with observation and info, unless it is ``RULE``."""
+    if policy is RULE or isinstance(policy, EpisodePolicy):
         return policy
     if is_asked_alone(policy) or takes_state(policy):
         return AskingPolicy(policy)
@@ -255,6 +255,8 @@ class EpisodePolicy(ABC):
         looks_back: Whether it needs the arguments of decisions that were answered before.
         sees_all: Whether it sees all agents, so that those that end are observed for the last time.
         takes_state: Whether it needs the state of the simulation.
+        plans: Whether it gets the environment.
+        asks: Whether it gets the decision.
         policy: The user's policy, for errors.
     """
 
@@ -263,6 +265,8 @@ class EpisodePolicy(ABC):
     looks_back = False
     sees_all = False
     takes_state = False
+    plans = False
+    asks = False
     policy: Policy
 
     @abstractmethod
@@ -279,8 +283,8 @@ class EpisodePolicy(ABC):
 
     def respond_to_many(
         self, agents: Sequence[Any], infos: Sequence[Info], states: object
-    ) -> Action:
-        """Answer the decisions of some agents, as a policy of ``simulate_many`` does.
+    ) -> tuple[list[Action], Mapping[str, Any]]:
+        """Answer the decisions of some agents. Return the actions, and the extras.
 
         ``states``: the stacked states, if it takes them.
         """
@@ -299,12 +303,7 @@ class DeferredPolicy(EpisodePolicy):
 
 
 class AskingPolicy(EpisodePolicy):
-    """A policy that is asked for one decision at a time.
-
-    Attributes:
-        plans: Whether it gets the environment.
-        asks: Whether it gets the decision.
-    """
+    """A policy that is asked for one decision at a time."""
 
     looks_back = True
 

@@ -152,8 +152,9 @@ class GlobalRandom:
             own.set_state(NUMPY.get_state(legacy=False))
         self._load_own = save_generators(own)
 
-    def begin(self, seed: int) -> None:
-        """Seed both generators, whose state must be in place, with the seed of an episode."""
+    @staticmethod
+    def begin(seed: int) -> None:
+        """Seed the generators that are in place with the seed of an episode."""
         random.seed(seed)
         np.random.seed(seed % 2**32)
 

@@ -6,35 +6,19 @@ A *code* turns a value of an agent's own space into one of the common space, or 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 
 from ...errors import InvalidActionError, ViewError, short_repr
 from ...simulation import Action, Observation
-from .actions import ILLEGAL, Check, Mask, action_check, open_mask
+from .actions import ILLEGAL, Mask, action_check, open_mask
 from .spaces import Array, Space, duplicate
 
 Encode: TypeAlias = Callable[[Observation], Observation]
 """Turns an observation of an agent's own space into one of the common space."""
-
-
-class ActionCode(Protocol):
-    """Translates between the actions of an agent and those of the common space."""
-
-    def decode(self, action: Action, mask: Mask | None) -> Action:
-        """Return the agent's own action for a common one.
-
-        Raises:
-            InvalidActionError: The action is not legal.
-        """
-
-    def encode(self, action: Action) -> Action:
-        """Return the common action for the agent's own one."""
-
-    def widen(self, mask: Mask | None) -> Mask | None:
-        """Return the mask of the common space. ``mask``: the agent's own; None: all is legal."""
 
 
 # -- observations ---------------------------------------------------------------------------------
@@ -50,34 +34,27 @@ def common_observations(parts: Sequence[Space]) -> tuple[Space, list[Encode | No
     """
     if all(part == parts[0] for part in parts):
         return parts[0], [None] * len(parts)
-    flat = [_flat(part) for part in parts]
-    size = max(part.shape[0] for part in flat)
-    dtype = np.result_type(*(part.dtype for part in flat))
+    flat: list[Any] = list(map(spaces.flatten_space, parts))
+    for part, vector in zip(parts, flat, strict=True):
+        if not isinstance(vector, spaces.Box):
+            raise ViewError(
+                "observations in different spaces must be flattened to share one, and this space"
+                f" cannot be: {part}"
+            )
+    size = max(len(vector.low) for vector in flat)
+    padded = [
+        np.pad((vector.low, vector.high), ((0, 0), (0, size - len(vector.low)))) for vector in flat
+    ]
     # Zero is in the common space only where it pads one of the others.
-    lows, highs = np.array([_padded_bounds(part, size) for part in flat]).swapaxes(0, 1)
-    common = spaces.Box(lows.min(0).astype(dtype), highs.max(0).astype(dtype), dtype=dtype.type)
-    return common, [_padding(part, size, dtype) for part in parts]
+    lows, highs = np.swapaxes(padded, 0, 1)
+    common = spaces.Box(lows.min(0), highs.max(0), dtype=lows.dtype.type)
+    return common, [_padding(part, common) for part in parts]
 
 
-def _padded_bounds(part: spaces.Box, size: int) -> tuple[Array, Array]:
-    padding = (0, size - part.shape[0])
-    return np.pad(part.low, padding), np.pad(part.high, padding)
-
-
-def _flat(part: Space) -> spaces.Box:
-    flat = spaces.flatten_space(part)
-    if not isinstance(flat, spaces.Box):
-        raise ViewError(
-            "observations in different spaces must be flattened to share one, and this space cannot"
-            f" be: {part}"
-        )
-    return flat
-
-
-def _padding(part: Space, size: int, dtype: np.dtype[np.generic]) -> Encode:
+def _padding(part: Space, common: spaces.Box) -> Encode:
     def encode(observation: Observation) -> Observation:
-        padded = np.zeros(size, dtype)
-        flat = spaces.flatten(part, observation)
+        padded = np.zeros(common.shape, common.dtype)
+        flat: Any = spaces.flatten(part, observation)
         padded[: len(flat)] = flat
         return padded
 
@@ -104,74 +81,86 @@ def common_actions(
         ViewError: A ``Box`` has no bounds, or a space is neither.
     """
     if all(part == parts[0] for part in parts):
-        return parts[0], [_Same(parts[0])] * len(parts)
-    sizes = [int(part.n) if isinstance(part, spaces.Discrete) else 0 for part in parts]
-    lengths = [_length(part) if isinstance(part, spaces.Box) else 0 for part in parts]
-    for part, size, length in zip(parts, sizes, lengths, strict=True):
-        if not size and not length:
-            raise ViewError(
-                "agents with different action spaces share one where each is a Discrete or a Box,"
-                f" not {part}"
-            )
-    most = max(sizes)
-    longest = max(lengths)
+        return parts[0], [ActionCode(parts[0], parts[0])] * len(parts)
+    most = max(int(part.n) if isinstance(part, spaces.Discrete) else 0 for part in parts)
+    longest = max(map(_length, parts))
     if not longest:
-        numbers = [part for part in parts if isinstance(part, spaces.Discrete)]
-        return spaces.Discrete(most), [_Numbered(part, most) for part in numbers]
+        numbers = spaces.Discrete(most)
+        return numbers, [_Numbered(part, numbers, most) for part in parts]
     common = spaces.Box(-1.0, 1.0, (most + longest,), np.float32)
-    check = action_check(common, clips=clips)
-    codes: list[ActionCode] = []
-    for part in parts:
-        if isinstance(part, spaces.Discrete):
-            codes.append(_Preferred(part, common, check, most))
-        elif isinstance(part, spaces.Box):
-            codes.append(_Scaled(part, common, check, most))
-    return common, codes
+    return common, [
+        (_Preferred if isinstance(part, spaces.Discrete) else _Scaled)(part, common, most, clips)
+        for part in parts
+    ]
 
 
 def preferences(own: spaces.Discrete) -> tuple[spaces.Box, ActionCode]:
     """Return a vector of preferences for the actions of a ``Discrete``, and its code."""
-    common = spaces.Box(-1.0, 1.0, (int(own.n),), np.float32)
-    return common, _Preferred(own, common, action_check(common), int(own.n))
+    most = int(own.n)
+    common = spaces.Box(-1.0, 1.0, (most,), np.float32)
+    return common, _Preferred(own, common, most)
 
 
-def _length(part: spaces.Box) -> int:
+def _length(part: Space) -> int:
+    """Return the number of an action's parts in a common vector, beside preferences."""
+    if isinstance(part, spaces.Discrete):
+        return 0
+    if not isinstance(part, spaces.Box) or not part.low.size:
+        raise ViewError(
+            "agents with different action spaces share one where each is a Discrete or a Box, not"
+            f" {part}"
+        )
     if not part.is_bounded():
         raise ViewError(
             f"the bounds of {part} must be finite, so that actions in [-1, 1] can be scaled to them"
         )
-    return int(np.prod(part.shape))
+    return part.low.size
 
 
-class _Same:
-    """The code of an agent whose own space is the common one."""
+class ActionCode:
+    """Translates between the actions of an agent and those of a common space.
 
-    def __init__(self, own: Space) -> None:
-        self._open = open_mask(own) if isinstance(own, spaces.Discrete) else None
+    This is the code of an agent whose own space is the common one.
+    """
+
+    def __init__(self, own: Space, common: Space, most: int = 0, clips: bool = False) -> None:
+        """Translate actions. ``most``: the number of actions of the largest ``Discrete``."""
+        self._own: Any = own
+        self._common = common
+        self._most = most
+        self._check = action_check(common, clips=clips)
 
     def decode(self, action: Action, mask: Mask | None) -> Action:
+        """Return the agent's own action for a common one.
+
+        Raises:
+            InvalidActionError: The action is not legal.
+        """
         return action
 
     def encode(self, action: Action) -> Action:
+        """Return the common action for the agent's own one."""
         return action
 
     def widen(self, mask: Mask | None) -> Mask | None:
-        own: Mask | None = duplicate(self._open if mask is None else mask)
+        """Return the mask of the common space. ``mask``: the agent's own; None: all is legal."""
+        if mask is None and isinstance(self._own, spaces.Discrete):
+            return open_mask(self._own)
+        own: Mask | None = duplicate(mask)
         return own
 
+    def _checked(self, action: Action) -> Action:
+        legal = self._check(action)
+        if legal is ILLEGAL:
+            raise InvalidActionError(f"{short_repr(action)} is not in {short_repr(self._common)}")
+        return legal
 
-class _Numbered:
+
+class _Numbered(ActionCode):
     """The code of a ``Discrete`` among larger ones."""
 
-    def __init__(self, own: spaces.Discrete, most: int) -> None:
-        self._own = own
-        self._check = action_check(spaces.Discrete(most))
-        self._most = most
-
     def decode(self, action: Action, mask: Mask | None) -> Action:
-        number = self._check(action)
-        if number is ILLEGAL:
-            raise InvalidActionError(f"{short_repr(action)} is not in Discrete({self._most})")
+        number = self._checked(action)
         if number >= self._own.n:
             raise InvalidActionError(
                 f"{short_repr(action)} is not an action of the agent, which has {self._own.n} of"
@@ -188,70 +177,46 @@ class _Numbered:
         return widened
 
 
-class _Vector:
-    """The code of an agent whose actions are parts of a common vector."""
-
-    def __init__(self, common: spaces.Box, check: Check, begin: int) -> None:
-        self._begin = begin  # after the preferences
-        self._size = common.shape[0]
-        self._common = common
-        self._check = check
-
-    def _checked(self, action: Action) -> Array:
-        legal = self._check(action)
-        if legal is ILLEGAL:
-            raise InvalidActionError(f"{short_repr(action)} is not in {short_repr(self._common)}")
-        return np.atleast_1d(legal)
-
-
-class _Scaled(_Vector):
-    """The code of a ``Box``."""
-
-    def __init__(self, own: spaces.Box, common: spaces.Box, check: Check, begin: int) -> None:
-        super().__init__(common, check, begin)
-        self._own = own
-        self._low = own.low.ravel().astype(np.float64)
-        self._width = own.high.ravel().astype(np.float64) - self._low
-        self._end = begin + len(self._low)
-
-    def decode(self, action: Action, mask: Mask | None) -> Action:
-        parts = self._checked(action)[self._begin : self._end].astype(np.float64)
-        values = self._low + (parts + 1.0) / 2.0 * self._width
-        if self._own.dtype.kind != "f":
-            values = np.rint(values)
-        own = values.astype(self._own.dtype).reshape(self._own.shape)
-        return np.clip(own, self._own.low, self._own.high)
-
-    def encode(self, action: Action) -> Action:
-        vector = np.zeros(self._size, np.float32)
-        width = np.where(self._width > 0.0, self._width, 1.0)
-        values = np.ravel(action) - self._low
-        vector[self._begin : self._end] = np.clip(2.0 * values / width - 1.0, -1.0, 1.0)
-        return vector
-
-    def widen(self, mask: Mask | None) -> Mask | None:
-        return np.ones(self._begin, np.int8) if self._begin else None
-
-
-class _Preferred(_Vector):
+class _Preferred(_Numbered):
     """The code of a ``Discrete`` beside a ``Box``: a preference for each action."""
 
-    def __init__(self, own: spaces.Discrete, common: spaces.Box, check: Check, begin: int) -> None:
-        super().__init__(common, check, begin)
-        self._own = own
-        self._numbers = _Numbered(own, begin)
-
     def decode(self, action: Action, mask: Mask | None) -> Action:
-        preferences = self._checked(action)[: self._own.n]
+        preferences = np.atleast_1d(self._checked(action))[: self._own.n]
         if mask is not None:
             preferences = np.where(mask, preferences, -np.inf)
         return int(preferences.argmax()) + int(self._own.start)
 
     def encode(self, action: Action) -> Action:
-        vector = np.zeros(self._size, np.float32)
-        vector[: self._begin] = -1.0
-        vector[self._numbers.encode(action)] = 1.0
+        vector = np.zeros(self._common.shape or (), np.float32)
+        vector[: self._most] = -1.0
+        vector[super().encode(action)] = 1.0
         return vector
 
-    def widen(self, mask: Mask | None) -> Mask:
-        return self._numbers.widen(mask)
+
+class _Scaled(ActionCode):
+    """The code of a ``Box``: a part of a common vector, after the preferences."""
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        """The lower bounds, and the widths up to the upper ones."""
+        low = self._own.low.astype(np.float64)
+        return low, self._own.high - low
+
+    def decode(self, action: Action, mask: Mask | None) -> Action:
+        own = self._own
+        low, width = self._bounds
+        parts = np.atleast_1d(self._checked(action))[self._most : self._most + low.size]
+        values = low + (parts.astype(np.float64).reshape(low.shape) + 1.0) / 2.0 * width
+        if own.dtype.kind != "f":
+            values = np.rint(values)
+        return np.clip(values.astype(own.dtype), own.low, own.high)
+
+    def encode(self, action: Action) -> Action:
+        low, width = self._bounds
+        values = (action - low) / np.where(width > 0.0, width, 1.0)
+        vector = np.zeros(self._common.shape or (), np.float32)
+        vector[self._most :][: values.size] = np.clip(2.0 * values.ravel() - 1.0, -1.0, 1.0)
+        return vector
+
+    def widen(self, mask: Mask | None) -> Mask | None:
+        return np.ones(self._most, np.int8) if self._most else None

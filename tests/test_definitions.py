@@ -218,7 +218,7 @@ def told_by(env, *actions):
     env.reset()
     for action in actions:
         env.step(action)
-    return env.unwrapped.simulation.log
+    return env.simulation.log
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_a_dict_says_what_each_action_decides(space, answers, refused):
     for action in refused:
         with pytest.raises(InvalidActionError, match="is not in its action space"):
             env.step(action)
-    assert env.unwrapped.simulation.log == []  # nothing has moved
+    assert env.simulation.log == []  # nothing has moved
     assert told_by(env, *map(np.int64, answers)) == list(answers.values())
 
 
@@ -313,7 +313,7 @@ def test_what_a_generator_or_coroutine_returns_is_decided_when_it_starts(
     assert env.reset()[0].tolist() == [1, 0]
     env.step(5)
     env.step(RULE)
-    assert env.unwrapped.simulation.log == [told, rule]
+    assert env.simulation.log == [told, rule]
 
 
 def test_one_function_may_have_many_definitions():
@@ -343,7 +343,7 @@ def test_choices_are_asked_once_with_the_arguments_and_make_the_mask():
     assert info["action_mask"].dtype == np.int8
     assert env.step(2)[4]["action_mask"].tolist() == [1, 1, 0, 0]
     assert len(made) == 2
-    assert env.unwrapped.simulation.log == [("board", "left", 2)]
+    assert env.simulation.log == [("board", "left", 2)]
 
 
 @pytest.mark.parametrize("choices", [list, lambda: range(5)])

@@ -38,7 +38,7 @@ def test_every_callable_gets_the_bound_arguments_of_calls_that_bind():
         for action, decided in ((1, 7), (RULE, (*args, kwargs["z"]))):
             env.reset()
             env.step({"ant": action})
-            assert env.unwrapped.simulation.log == [decided]
+            assert env.simulation.log == [decided]
         before = {"apply": (1,), "rule action": (decided,)}
         assert seen == {name: ((*before.get(name, ()), *args), kwargs) for name in seen}
         assert len(seen) == 6

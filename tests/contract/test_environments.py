@@ -10,7 +10,6 @@ from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, si
 from simenv_marl.errors import (
     AgentError,
     DefinitionError,
-    EpisodeOverError,
     InvalidActionError,
     NoDecisionError,
     OptionValueError,
@@ -18,7 +17,7 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
-from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play
+from tests.worlds.models import Script, begun, calling, decision, decisions, define, plainly, play
 
 PUMP, FAN = decision(agent="pump_0"), decision(agent="fan_0")
 NAMED = define(agent=lambda name: name)(lambda name: "rule")
@@ -175,28 +174,15 @@ def test_instances_may_change_the_options_of_their_class():
 # -- max_steps ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("actions", [1, RULE])
-def test_max_steps_runs_on_to_the_next_decision_and_truncates(actions):
-    pump = decision(reward_mapping=lambda: len(env.simulation.log))
-    env = single_env(calling(*[pump] * 5), pump, max_steps=2)
-    for _ in range(2):
-        env.reset()
-        assert env.step(actions)[1:4] == (1.0, False, False)
-        # The second step lets the model run up to its third decision, and is rewarded there.
-        assert env.step(actions)[1:4] == (2.0, False, True)
-        with pytest.raises(EpisodeOverError, match="begin the next one"):
-            env.step(actions)
-    env = single_env(calling(pump, pump), pump, max_steps=2)
-    env.reset()
-    env.step(actions)
-    assert env.step(actions)[1:4] == (2.0, True, False)  # it has ended by itself
-
-
 def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
-    env = aec_env(
-        calling(*[PUMP, FAN] * 5), [PUMP, FAN], max_steps=3, policies={FAN: lambda observation: 1}
+    env = begun(
+        aec_env(
+            calling(*[PUMP, FAN] * 5),
+            [PUMP, FAN],
+            max_steps=3,
+            policies={FAN: lambda observation: 1},
+        )
     )
-    env.reset()
     for _ in range(3):
         with pytest.raises(InvalidActionError, match="is not in its action space"):
             env.step(99)
@@ -253,8 +239,7 @@ def test_a_policys_action_is_checked_and_mapped():
     env = aec_env(calling(fan, PUMP), [fan, PUMP], policies={fan: lambda observation: np.int64(3)})
     play(env, 1)
     assert env.unwrapped.simulation.log == [("mapped", 3), 1]
-    env = aec_env(calling(PUMP, fan), [fan, PUMP], policies={fan: lambda observation: 10})
-    env.reset()
+    env = begun(aec_env(calling(PUMP, fan), [fan, PUMP], policies={fan: lambda observation: 10}))
     with pytest.raises(InvalidActionError, match="is not in its action space"):
         env.step(1)
     env.reset()
@@ -276,13 +261,13 @@ def test_points_of_one_agent_have_equal_spaces_and_one_policy():
     few = {"agent": lambda: "pump_0", "action_space": spaces.Discrete(3)}
     named, other = decision(**few), decision(agent=lambda: "pump_0")
     for first, second in ((PUMP, named), (named, other)):
-        env = aec_env(calling(first, second), [first, second])
-        env.reset()
+        env = begun(aec_env(calling(first, second), [first, second]))
         with pytest.raises(AgentError, match="whose spaces or policies differ"):
             env.step(1)
     again = decision(agent=lambda: "pump_0")
-    env = aec_env(calling(PUMP, again), [PUMP, again], policies={again: lambda observation: 1})
-    env.reset()
+    env = begun(
+        aec_env(calling(PUMP, again), [PUMP, again], policies={again: lambda observation: 1})
+    )
     with pytest.raises(AgentError, match="whose spaces or policies differ"):
         env.step(1)
 
@@ -317,8 +302,7 @@ class Housed(Script):
 )
 def test_a_point_that_is_named_has_the_simulations_own_definition(source):
     for named in (f"{__name__}.Hut.heat", [Hut.heat]):
-        env = single_env(source, named)
-        env.reset()
+        env = begun(single_env(source, named))
         env.step(3)
         assert env.simulation.log == [30, "rule"]
     with pytest.raises(DefinitionError, match="has no definition here"):

@@ -16,7 +16,7 @@ from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, decisions, follow_the_rule, play, script
+from tests.worlds.models import begun, calling, decision, decisions, follow_the_rule, play, script
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 
@@ -136,8 +136,7 @@ def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity
         "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health"
         " 6, 1 health 5, 2 forgotten"
     )
-    env = aec_env(life(program), beings())
-    env.reset()
+    env = begun(aec_env(life(program), beings()))
     seen = []
     while not any(env.terminations.values()):
         seen.append((env.agent_selection, env.last()[0].tolist(), env.observe("being_0").tolist()))
@@ -226,12 +225,11 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
 @VIEWS
 def test_rule_and_whatever_is_sampled_are_actions(view, space):
     decide = decision(action_space=space, agent="a_0", action_space_mapping=lambda action: "sample")
-    env = view(calling(*[decide] * 6), decide)
-    env.reset(seed=1)
+    env = begun(view(calling(*[decide] * 6), decide), 1)
     env.step(RULE)
     for _ in range(5):
         env.step((env.action_space("a_0") if view is aec_env else env.action_space).sample())
-    assert env.unwrapped.simulation.log == ["rule"] + ["sample"] * 5
+    assert env.simulation.log == ["rule"] + ["sample"] * 5
 
 
 # -- 5.6: entities --------------------------------------------------------------------------------
@@ -260,7 +258,7 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
         script(main), beings(removed_by=(), **changes), policies=policy and {"being_2": policy}
     )
     turns = play(env, actions)
-    assert env.unwrapped.simulation.log == [
+    assert env.simulation.log == [
         [True, False, False],
         [True, True, False],
         [True, True, True],
@@ -270,30 +268,6 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
     assert sorted(turn.agent for turn in turns if turn.terminated) == [
         f"being_{n}" for n in sorted(set(asked))
     ]
-
-
-@pytest.mark.parametrize(
-    ("view", "action", "gone"),
-    [
-        (single_env, RULE, [True, False]),
-        (single_env, 0, [True, False]),
-        (aec_env, 1, [False, True]),
-    ],
-)
-def test_a_choice_that_the_model_lets_go_is_not_kept_alive(view, action, gone):
-    flock = []
-    chase = decision(lambda: flock[0], choices=lambda: list(flock), action_space=spaces.Discrete(2))
-
-    def main(simulation):
-        flock[:] = [Being(0), Being(1)]
-        watched = [weakref.ref(being) for being in flock]
-        flock.remove(chase())
-        simulation.log += [watch() is None for watch in watched]
-
-    env = view(script(main), chase)
-    env.reset()
-    env.step(action)
-    assert env.unwrapped.simulation.log == gone
 
 
 # -- 5.7: actions ---------------------------------------------------------------------------------
@@ -327,15 +301,14 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
         agent="a_0",
         action_space_mapping=lambda action: moved.append(action) or "done",
     )
-    env = view(calling(decide, decide), decide)
-    env.reset(seed=3)
+    env = begun(view(calling(decide, decide), decide), 3)
     for step, right in enumerate(legal):
         for action in illegal:
             before = env.last() if view is aec_env else None
             with pytest.raises(InvalidActionError, match="a_0") as caught:
                 env.step(action)
             assert isinstance(caught.value, ValueError)
-            assert len(moved) == len(env.unwrapped.simulation.log) == step
+            assert len(moved) == len(env.simulation.log) == step
             if view is aec_env:
                 assert env.agent_selection == "a_0"
                 after = env.last()
@@ -345,4 +318,4 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
         assert np.array_equal(
             np.asarray(moved[-1]), np.asarray(right).astype(space.dtype or object)
         )
-    assert env.unwrapped.simulation.log == ["done", "done"]
+    assert env.simulation.log == ["done", "done"]

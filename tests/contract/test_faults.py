@@ -297,7 +297,7 @@ def interrupt_anywhere(name):
             whole_run(env)
             env.reset(seed=1)
             act(env)
-            assert env.unwrapped.simulation.log == ["rule", 3], where
+            assert env.simulation.log == ["rule", 3], where
             env.close()
         assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
     assert number > 100
@@ -354,7 +354,7 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
     env, ends = view(Model, decide), set()
     for room in range(1, 60):
         env.reset()
-        log = env.unwrapped.simulation.log
+        log = env.simulation.log
         for use in (partial(act, env), env.reset, env.close):
             try:
                 deep_down(use, room)
@@ -367,6 +367,6 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
         assert log[-1] == "unwound"
         act(env)
         act(env)
-        assert env.unwrapped.simulation.log == ["rule", 3, 3, "unwound"]
+        assert env.simulation.log == ["rule", 3, 3, "unwound"]
         assert nobody_is_asked()
     assert ends >= {"went well", "came to the end"}

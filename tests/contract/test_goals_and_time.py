@@ -30,7 +30,7 @@ from simenv_marl.errors import (
 )
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, define, play, step
+from tests.worlds.models import begun, calling, decision, define, play, step
 from tests.worlds.undone import registries_put_back
 
 EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
@@ -127,8 +127,7 @@ def test_mappings_of_goals_take_as_many_arguments_as_they_want():
 
 
 def test_rewards_are_computed_anew_for_other_goals():
-    env = single_env(Walk, goals())
-    env.reset(seed=3)
+    env = begun(single_env(Walk, goals()), 3)
     observations, rewards, _, truncations, infos = zip(
         *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
     )
@@ -207,8 +206,7 @@ def test_masks_on_request_are_flat_and_pass_through_wrappers():
     assert masks().tolist() == [True] * 5
     for space in (spaces.Discrete(5, start=2), parts):
         ant = decision(agent="ant_0", action_space=space)
-        env = single_env(calling(ant), ant)
-        env.reset()
+        env = begun(single_env(calling(ant), ant))
         assert env.action_masks().tolist() == [True] * 5
 
 
@@ -305,25 +303,14 @@ def times(turns, agent):
     return [(turn.info["time"], turn.info["elapsed"]) for turn in turns if turn.agent == agent]
 
 
-def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = aec_env(
-        lambda: Clock((0, ant), (2, bee), (2.5, ant), (7, ant), (7, bee), end=11), [ant, bee]
-    )
-    for _ in range(2):
-        turns = play(env, 1)
-        assert times(turns, "ant_0") == [(0, 0), (2.5, 2.5), (7, 4.5), (11, 4)]
-        assert times(turns, "bee_0") == [(2, 0), (7, 5), (11, 4)]
-    assert {type(value) for turn in turns for value in turn.info.values()} == {float}
-
-
 def test_the_time_of_the_announced_and_of_the_dead():
     program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
-    env = aec_env(
-        life(program, announced=[0, 1], timed=True),
-        beings(action_mask_mapping=lambda being: ONE_MASK),
+    env = begun(
+        aec_env(
+            life(program, announced=[0, 1], timed=True),
+            beings(action_mask_mapping=lambda being: ONE_MASK),
+        )
     )
-    env.reset()
     told = env.infos["being_1"]
     assert (told["time"], told["elapsed"], told["action_mask"].tolist()) == (
         0.0,
@@ -401,22 +388,9 @@ def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discou
             (7.0, 4.0),
             (8.0, 1.0),
         ]
+        assert {type(info[name]) for info in infos for name in ("time", "elapsed")} == {float}
         expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
         assert [info.get("discount") for info in infos] == expected
-
-
-def test_forced_moves_are_discounted_with_the_decision_after_them():
-    masks = iter([[1, 1], [1, 0], [1, 1], [1, 1]])
-    ant = decision(
-        agent="ant_0",
-        action_space=spaces.Discrete(2),
-        action_mask_mapping=lambda: np.array(next(masks), np.int8),
-    )
-    env = single_env(
-        lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5
-    )
-    env.reset()
-    assert env.step(1)[-1]["discount"] == exp(-3.0)
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
@@ -469,8 +443,7 @@ def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
 
 def test_everything_is_legal_for_those_who_have_not_decided_yet():
     ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
-    env = aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk])
-    env.reset()
+    env = begun(aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk]))
     env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
     assert env.infos["elk_0"]["action_mask"].tolist() == [1] * 10
     env.reset()
@@ -575,8 +548,7 @@ def test_states_that_cannot_be_are_refused():
         (lambda: Ragged(ant), {}, ObservationError, "has returned an illegal value: setting"),
         (calling(ant), {}, NotImplementedError, None),
     ):
-        env = parallel_env(make, ant, **options)
-        env.reset()
+        env = begun(parallel_env(make, ant, **options))
         with pytest.raises(error, match=match):
             env.state()
     with pytest.raises(OptionValueError, match="must be a gymnasium space"):
@@ -612,8 +584,7 @@ def test_the_state_may_be_what_all_observe(make):
         env.step(RULE)
     assert env.state().tolist() == [1, 2, 0, 0, 1]
     for view in (single_env, joint_env):
-        env = view(calling(ant), ant, state_space="observations")
-        env.reset()
+        env = begun(view(calling(ant), ant, state_space="observations"))
         assert env.state().tolist() == [1, 2]
         assert env.state() in env.state_space
 

@@ -139,7 +139,7 @@ class Player:
         for action in self.actions:
             other.step(action)
         assert other.told == self.told
-        ours, theirs = self.env.unwrapped.simulation, other.env.unwrapped.simulation
+        ours, theirs = self.env.simulation, other.env.simulation
         assert (ours.trace, ours.random.getstate()) == (theirs.trace, theirs.random.getstate())
         other.env.close()
 

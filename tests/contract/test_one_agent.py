@@ -33,7 +33,7 @@ from simenv_marl.errors import (
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, play
+from tests.worlds.models import begun, calling, decision, play
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}
@@ -101,7 +101,7 @@ def zeros():
 
 
 def moves_of(env, agent):
-    return [move for name, move in env.unwrapped.simulation.log if name == agent]
+    return [move for name, move in env.simulation.log if name == agent]
 
 
 MOVE = {f"{PLACE}.move": definition()}
@@ -151,10 +151,16 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) ->
 
 def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
-    env = single_env(
-        Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE}
+    env = begun(
+        single_env(
+            Casino,
+            NAMED,
+            agent="mover",
+            possible_agents=["mover", "better"],
+            policies={"better": RULE},
+        ),
+        0,
     )
-    env.reset(seed=0)
     while not env.step(0)[2]:
         pass
     assert env.simulation.log == [(5, 1), (5, 1)]
@@ -168,8 +174,7 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> N
     with pytest.raises(AgentError, match="possible_agents"):
         single_env(Casino, named, agent="player_red")
     roster = {f"{PLACE}.move": NAMES, f"{PLACE}.bet": [f"{name}_bet" for name in NAMES]}
-    env = single_env(Casino, named, agent="player_red_bet", possible_agents=roster)
-    env.reset(seed=0)
+    env = begun(single_env(Casino, named, agent="player_red_bet", possible_agents=roster), 0)
     assert env.step(1)[2]
     assert env.simulation.log == [(6, 2), (5, 2)]
 
@@ -296,7 +301,7 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
         assert terminations == dict.fromkeys(NAMES, ended)
         assert {name: info["acted"] for name, info in infos.items()} == dict.fromkeys(NAMES, True)
         assert joint.step(zeros())[2] == ended
-    assert [move for _, move in env.unwrapped.simulation.log] == [1] * 12
+    assert [move for _, move in env.simulation.log] == [1] * 12
 
 
 @pytest.mark.parametrize(
@@ -320,8 +325,7 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
 )
 def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
     points = {f"{PLACE}.move": definition(choices=None, **changes)}
-    env = single_env(Game, points, agent="player_red", skip_forced=True)
-    env.reset(seed=0)
+    env = begun(single_env(Game, points, agent="player_red", skip_forced=True), 0)
     for action in asked:
         env.step(action)
     assert moves_of(env, "player_red") == moves
@@ -339,8 +343,7 @@ def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
     assert {turn.agent: turn[2:5] for turn in play(aec)} == dict.fromkeys(NAMES, (3.0, True, False))
     with pytest.raises(EpisodeOverError):
         aec.step(0)
-    parallel = parallel_env(Forced, MOVE, **ROSTER)
-    parallel.reset(seed=0)
+    parallel = begun(parallel_env(Forced, MOVE, **ROSTER), 0)
     assert parallel.agents == list(NAMES)
     assert parallel.step(zeros())[2] == dict.fromkeys(NAMES, True)
     actions = np.zeros(2, np.int64)
@@ -348,8 +351,7 @@ def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
         (RED | {"skip_forced": True}, actions, 3.0),
         (ROSTER | {"view": "joint"}, dict.fromkeys(NAMES, actions), 4.0),
     ):
-        vector = vector_env(Forced, MOVE, num_envs=2, **options)
-        vector.reset(seed=0)
+        vector = begun(vector_env(Forced, MOVE, num_envs=2, **options), 0)
         for ended in (True, False, True):
             _, rewards, terminations, *_ = vector.step(action)
             assert terminations.tolist() == [ended] * 2
@@ -367,8 +369,7 @@ def flown(make, space, action, *, clip_actions=True):
     """The argument of the mapping of agent ``pilot``, or of the last one among several."""
     taken = []
     fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
-    env = make(calling(fly), fly, clip_actions=clip_actions)
-    env.reset(seed=0)
+    env = begun(make(calling(fly), fly, clip_actions=clip_actions), 0)
     try:
         env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
     except InvalidActionError:
@@ -447,21 +448,17 @@ def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or
     points = beings(choices=lambda being: [1] if being.number == 0 else [1, 2])
     one = {"agent": "being_0", "skip_forced": True}
     both = {"possible_agents": ["being_0", "being_1"], "skip_forced": True}
-    env = parallel_env(life(program), points, **both)
-    env.reset(seed=1)
+    env = begun(parallel_env(life(program), points, **both), 1)
     assert sorted(env.agents) == ["being_0", "being_1"]
     _, rewards, terminations, _, _ = env.step({"being_0": 0, "being_1": 0})
     assert rewards == {"being_0": 2.0, "being_1": 1.0}
     assert terminations == {"being_0": True, "being_1": False}
     assert env.agents == ["being_1"]
-    joint = joint_env(life(program), points, **both)
-    joint.reset(seed=1)
+    joint = begun(joint_env(life(program), points, **both), 1)
     assert joint.step({"being_0": 0, "being_1": 0})[1] == 3.0
-    single = single_env(life(program), points, **one)
-    single.reset(seed=1)
+    single = begun(single_env(life(program), points, **one), 1)
     assert single.step(0)[1:4] == (3.0, True, False)
-    vector = vector_env(life(program), points, num_envs=2, **one)
-    vector.reset(seed=1)
+    vector = begun(vector_env(life(program), points, num_envs=2, **one), 1)
     _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
     assert (rewards.tolist(), terminations.tolist()) == ([3.0, 3.0], [True, True])
     vector.close()

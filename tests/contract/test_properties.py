@@ -34,7 +34,7 @@ def made(design: Design) -> Any:
 
 def agrees(env: Any, reference: Reference) -> None:
     """An AEC environment that stands where the reference does says what the reference says."""
-    assert env.unwrapped.simulation.trace == reference.trace
+    assert env.simulation.trace == reference.trace
     if reference.ends is None:
         told = reference.turns[-1]
         assert env.agent_selection == told.agent

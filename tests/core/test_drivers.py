@@ -18,7 +18,16 @@ from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.processes import run_code
-from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
+from tests.worlds.models import (
+    Script,
+    begun,
+    calling,
+    culprits,
+    decision,
+    nobody_is_asked,
+    notes,
+    script,
+)
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 REFUSED = "choose was called in a thread that the simulation has started"
@@ -81,7 +90,7 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
             assert variable.get() == user
             for action in (1, 2, RULE):
                 env.step(action)
-            assert env.unwrapped.simulation.log == [
+            assert env.simulation.log == [
                 user,
                 "the model's",
                 1,
@@ -110,8 +119,7 @@ def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
     def use():
-        env = single_env(calling(deeper, deeper), deeper, driver=inner)
-        env.reset()
+        env = begun(single_env(calling(deeper, deeper), deeper, driver=inner))
         return [env.step(1)[1:3], env.step(2)[1:3], env.simulation.log]
 
     with ThreadPoolExecutor(1) as pool:
@@ -121,8 +129,7 @@ def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
             lambda: in_a_thread(other),  # which is no point of the environment
             lambda: in_a_thread(use),
         ]
-        env = single_env(calling(decide, *functions, decide), decide, driver=driver)
-        env.reset()
+        env = begun(single_env(calling(decide, *functions, decide), decide, driver=driver))
         env.step(1)
         env.step(2)
     assert env.simulation.log == [1, "rule", "its rule", [(1.0, False), (1.0, True), [1, 2]], 2]
@@ -158,8 +165,7 @@ def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
             simulation.log.append(decide())
 
     roots, decide = [], decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset(seed=5)
+    env = begun(single_env(script(main), decide, driver=driver), 5)
     with pytest.raises(WrongThreadError, match=REFUSED) as caught:
         env.step(1)
     assert env.simulation.log == [1, "refused"]
@@ -185,8 +191,7 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
 
     decide = decision()
     for function, kind in ((passed_on, WrongThreadError), (followed_by_another, KeyError)):
-        env = single_env(calling(decide, function), decide, driver=driver)
-        env.reset()
+        env = begun(single_env(calling(decide, function), decide, driver=driver))
         with pytest.raises(kind) as caught:
             env.step(1)
         env.close()

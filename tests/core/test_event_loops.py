@@ -12,7 +12,7 @@ import pytest
 from simenv_marl import SimulationInterface, single_env
 from simenv_marl.errors import SimulationError
 from tests.conftest import DRIVERS
-from tests.worlds.models import decision, script
+from tests.worlds.models import begun, decision, script
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
@@ -163,9 +163,7 @@ def deciding(driver, interrupted=False):
         asyncio.run(work(simulation))
 
     decide = decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    return env
+    return begun(single_env(script(main), decide, driver=driver))
 
 
 @DRIVERS
@@ -234,10 +232,11 @@ async def waited(clerk):
 @pytest.mark.parametrize("how", ["close", "reset", "collected"])
 def test_tasks_that_are_unwound_are_not_reported(driver, way, steps, how, loud):
     decide = decision()
-    env = single_env(
-        script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver
+    env = begun(
+        single_env(
+            script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver
+        )
     )
-    env.reset()
     for _ in range(steps):
         env.step(1)
     if how != "collected":
@@ -261,8 +260,9 @@ def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
             del keep
 
     decide = decision()
-    env = single_env(script(lambda simulation: asyncio.run(grouped(clerk))), decide, driver=driver)
-    env.reset()
+    env = begun(
+        single_env(script(lambda simulation: asyncio.run(grouped(clerk))), decide, driver=driver)
+    )
     env.close()
     assert told(loud) == ["Task exception was never retrieved"]
     assert isinstance(loud.records[-1].exc_info[1], ValueError)
@@ -308,12 +308,13 @@ async def office(simulation, decide, cleanup):
 @pytest.mark.parametrize("end", ["close", "reset"])
 def test_a_loop_of_the_model_cancels_its_tasks_at_the_end(driver, end):
     decide, cleanup = decision(), []
-    env = single_env(
-        script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),
-        decide,
-        driver=driver,
+    env = begun(
+        single_env(
+            script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),
+            decide,
+            driver=driver,
+        )
     )
-    env.reset()
     log = env.simulation.log
     getattr(env, end)()
     assert sorted(log) == ["generator closed"] * 2 + ["task cancelled"] * 3

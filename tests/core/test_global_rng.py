@@ -8,7 +8,7 @@ import pytest
 
 from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import OptionValueError, WrongThreadError
-from tests.worlds.models import define, play
+from tests.worlds.models import begun, define, play
 
 
 class Casino:
@@ -94,7 +94,7 @@ def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
         for _ in range(6):
             for env in envs.values():
                 assert_untouched(env.step, RULE)
-        assert {seed: env.unwrapped.simulation.log for seed, env in envs.items()} == logs
+        assert {seed: env.simulation.log for seed, env in envs.items()} == logs
     for env in envs.values():
         assert_untouched(env.reset)
         assert_untouched(env.close)
@@ -102,8 +102,7 @@ def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_without_it_generators_are_everybodys():
-    env = aec_env(Casino, POINTS)
-    env.reset(seed=7)
+    env = begun(aec_env(Casino, POINTS), 7)
     before = world()
     env.step(RULE)
     assert world() != before
@@ -187,10 +186,14 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
         return [card, 0]
 
     before = world()
-    env = aec_env(
-        Casino, {BET: define(agent="player_0", observation_space_mapping=observe)}, global_rng=True
+    env = begun(
+        aec_env(
+            Casino,
+            {BET: define(agent="player_0", observation_space_mapping=observe)},
+            global_rng=True,
+        ),
+        7,
     )
-    env.reset(seed=7)
     env.step(RULE)
     assert len(errors) == 2
     other.reset(seed=1)

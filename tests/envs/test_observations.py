@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 from simenv_marl import aec_env, branch, clone, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core.values.spaces import same
-from tests.worlds.models import Timed, decision, define
+from tests.worlds.models import Timed, begun, decision, define
 
 PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 TREE = spaces.Dict({"pair": PAIR, "row": spaces.Sequence(PAIR)})
@@ -136,8 +136,7 @@ def test_an_observation_that_stays_is_another_object_each_time() -> None:
                 Farm.keeper.water_more()
 
     Farm.keeper = Field()
-    env = parallel_env(Herd, points(False))
-    env.reset(seed=1)
+    env = begun(parallel_env(Herd, points(False)), 1)
     observations, *_ = env.step({"a": 1})
     for _ in range(2):
         before = observations["a"]
@@ -154,10 +153,12 @@ def test_a_policy_that_changes_its_observation_changes_nothing_else() -> None:
 
     states = []
     for policy in (halve, lambda observation: 1):
-        env = single_env(
-            Farm, points(False), agent="b", policies={"a": policy}, state_space="observations"
+        env = begun(
+            single_env(
+                Farm, points(False), agent="b", policies={"a": policy}, state_space="observations"
+            ),
+            1,
         )
-        env.reset(seed=1)
         states.append(env.state().tolist())
     assert states[0] == states[1]
 
@@ -175,8 +176,7 @@ def test_elapsed_times_count_from_the_last_decision_that_was_asked(make) -> None
         for _ in range(5):
             simulation.log.append(decide())
 
-    env = make(lambda: Timed(main), decide, skip_forced=True, discount_rate=0.1)
-    env.reset(seed=1)
+    env = begun(make(lambda: Timed(main), decide, skip_forced=True, discount_rate=0.1), 1)
     action = 1 if make is single_env else {"a": 1}
     info = env.step(action)[-1]
     info = info.get("a", info)

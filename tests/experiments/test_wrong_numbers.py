@@ -88,18 +88,6 @@ def test_draws_after_seeding_are_errors_only_beside_other_runs(kind) -> None:
     assert fates(kind, BET, batched=True, batch_size=1) == FINE
 
 
-def test_a_class_that_draws_in_some_runs_has_errors_there() -> None:
-    class Moody(Casino):
-        def reset(self, seed):
-            self.stakes = self.draw() if seed == 1 else 0.0
-
-        def bet(self):
-            return 1.0
-
-    frame = evaluate(Moody, {"rule": {}}, seeds=SEEDS, points=BET).frame
-    assert dict(zip(frame["seed"], frame["status"], strict=True)) == {0: "ok", 1: "error", 2: "ok"}
-
-
 class Herd:
     """Animals that are freed before the reward of their decision is known."""
 

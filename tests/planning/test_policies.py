@@ -138,7 +138,7 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
     env = begun(make(Duel, tame(), policies={"left": planner(method=method)}))
     while not step(env, 1, "right"):
         pass
-    assert env.unwrapped.simulation.value == by_hand()[1]
+    assert env.simulation.value == by_hand()[1]
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_planners_decide_in_vector_environments():
     envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
         envs.step(np.array([1, 1]))
-    assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
+    assert [env.simulation.turn for env in envs.envs] == [3, 3]
     envs.close()
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from tests.worlds.many_worlds import Being, banish
+from simenv_marl import SimulationInterface
+from tests.worlds.many_worlds import Being, banish, being_of
 from tests.worlds.models import Turn
 
 
-class Life:
+class Life(SimulationInterface):
     """A simulation of ten beings; ``now`` is told as its time where it is timed."""
 
     def __init__(
@@ -39,6 +40,9 @@ class Life:
             self.beings[number].leave()
         elif what == "banished":
             banish("nowhere", self.beings[number])
+        elif what == "ends":  # without any call that could be named
+            self.end_agent(None)  # nobody
+            self.end_agent(being_of(self.beings[number]))
         elif what == "forgotten":
             del self.beings[number]
         elif what == "fails":

@@ -99,6 +99,12 @@ def unwinding(decide: Callable[[], Any], log: list[Any]) -> Callable[[], Script]
     return script(main)
 
 
+def begun(env, seed=None):
+    """An environment in which an episode has begun."""
+    env.reset(seed=seed)
+    return env
+
+
 class Turn(NamedTuple):
     """What one pass of ``agent_iter`` has seen and done."""
 

@@ -10,6 +10,9 @@ from typing import Any
 
 import gymnasium
 import pettingzoo
+import pytest
+
+from tests.worlds.models import notes
 
 MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
 """The modules that pages of the documentation import from the folder they are in."""
@@ -70,3 +73,12 @@ def held(place: Any) -> dict[str, Any]:
         for name, value in vars(place).items()
         if not name.startswith("__") or name == "__init__"
     }
+
+
+@contextmanager
+def fails(error, *words, match=None):
+    """Expect an error whose notes have all of these words."""
+    with pytest.raises(error, match=match) as caught:
+        yield caught
+    for word in words:
+        assert word in notes(caught.value)

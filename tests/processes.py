@@ -14,6 +14,22 @@ from simenv_marl.core.plans.options import Options
 ROOT = Path(__file__).parents[1]
 
 
+def python(*words: object, status: int = 0, **options: Any) -> subprocess.CompletedProcess[Any]:
+    """Run Python where it finds the library and the tests, until it ends with that status."""
+    path = os.pathsep.join([*filter(None, sys.path), str(ROOT)])
+    given = {
+        "env": {**os.environ, "PYTHONPATH": path, **options.pop("env", {})},
+        "cwd": ROOT,
+        "text": True,
+        "timeout": 120,
+    }
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, check=False, **given | options
+    )
+    assert done.returncode == status, (done.stdout, done.stderr)
+    return done
+
+
 def alone(function: Callable[..., None], *arguments: Any) -> None:
     """Call a function of a test file in a fresh process, without open resources of other tests.
 
@@ -28,15 +44,7 @@ gc.freeze()  # so that the function's own collections look at what it makes
 Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or {})["driver"]!r}
 {function.__name__}(*{arguments!r})
 """
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)]),
-    }
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", code)
 
 
 def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
@@ -44,14 +52,9 @@ def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
 
     One that ends well prints no errors; one that hangs is ended.
     """
-    command = [sys.executable, *options, "-c", "\n".join(map(dedent, parts))]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr if status == 0 else "") == (status, ""), (
-        done.stdout + done.stderr
-    )
-    return done.stdout
+    done = python(*options, "-c", "\n".join(map(dedent, parts)), status=status)
+    assert status or done.stderr == "", done.stdout + done.stderr
+    return str(done.stdout)
 
 
 def descriptors() -> dict[str, str]:

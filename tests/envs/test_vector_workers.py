@@ -7,8 +7,6 @@ import multiprocessing
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 from functools import partial
@@ -23,9 +21,10 @@ from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
 from tests.conftest import DRIVERS
 from tests.envs.test_vector import begun
-from tests.processes import ROOT, alone, descriptors, gone
+from tests.processes import alone, descriptors, gone, python
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 from tests.worlds.models import notes
+from tests.worlds.undone import fails
 
 pytestmark = FORKS
 
@@ -128,10 +127,8 @@ def test_an_error_says_of_which_simulation_and_the_next_reset_works():
         ),
     )
     envs.reset(seed=0, options={"poor": 2})
-    with pytest.raises(RewardError, match="not finite") as caught:
+    with fails(RewardError, "sub-environment 2", "seed 2", match="not finite"):
         envs.step(ONES)
-    assert "sub-environment 2" in notes(caught.value)
-    assert "seed 2" in notes(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
     with pytest.raises(EpisodeOverError, match="without a reset_mask"):
@@ -276,26 +273,20 @@ if __name__ == "__main__":
 """
 
 
-def run_script(path: Path, text: str, *options: str) -> Any:
-    path.write_text(text, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-    # The output ends when the last worker does.
-    command = [sys.executable, *options, str(path)]
-    return subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-
-
 @pytest.mark.parametrize("context", ["spawn", FORK])
-@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "os.kill(os.getpid(), 9)"])
-def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [("", 0), ("raise KeyboardInterrupt", -2), ("os.kill(os.getpid(), 9)", -9)],
+)
+def test_nothing_stays_behind_when_the_interpreter_ends(context, end, status, tmp_path):
     strict = ["-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev"]
-    done = run_script(tmp_path / "script.py", SCRIPT.format(context=context, end=end), *strict)
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
+    # The output ends when the last worker does.
+    done = python(*strict, path, status=status)
     assert done.stdout.splitlines()[0] == "[1.0, 2.0]"
     assert done.stdout.count("unwound") == 2
-    if not end:
-        assert done.stderr == ""
-        assert done.returncode == 0
+    assert end or done.stderr == ""
     assert "leaked" not in done.stderr
 
 
@@ -352,6 +343,7 @@ def start_in_vain(error: str) -> None:
 
 def test_a_script_without_a_main_guard_raises_an_error_that_names_it(tmp_path):
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
-    last = run_script(tmp_path / "script.py", text).stderr.strip().splitlines()[-1]
+    (tmp_path / "script.py").write_text(text, encoding="utf-8")
+    last = python(tmp_path / "script.py", status=1).stderr.strip().splitlines()[-1]
     assert last.startswith("simenv_marl.errors.WorkerError: ")
     assert 'if __name__ == "__main__":' in last

@@ -139,9 +139,8 @@ GOAL = {"achieved_goal_mapping": list, "desired_goal_mapping": list, "compute_re
 )
 def test_definitions_that_cannot_work_are_refused(changes, match):
     """Also where they are made of others by replacing parts."""
-    with pytest.raises(DefinitionError, match=f"make_step: .*{match}") as caught:
+    with pytest.raises(DefinitionError, match=f"make_step: .*{match}"):
         define(**changes)
-    assert isinstance(caught.value, ValueError)
     spared = {"action_space_mapping": None} if changes.keys() & {"apply", "choices"} else {}
     with pytest.raises(DefinitionError, match=match):
         dataclasses.replace(define(), **spared | changes)

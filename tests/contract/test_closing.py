@@ -8,10 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from simenv_marl import (
-    aec_env,
     branch,
-    joint_env,
-    parallel_env,
     simulate,
     simulate_many,
     single_env,
@@ -19,6 +16,7 @@ from simenv_marl import (
 )
 from simenv_marl.data import collect_episodes
 from simenv_marl.experiments import evaluate
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import begun, define
 from tests.worlds.undone import fails
 
@@ -105,7 +103,7 @@ def test_close_is_called_before_the_next_reset_and_when_the_environment_is_close
 
 
 @pytest.mark.parametrize("shop", [Shop, Broken])
-@pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
+@EVERY_VIEW
 def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error(view, shop):
     envs = [view(shop, BOOKS)]
     envs[0].reset(seed=1)

@@ -14,15 +14,15 @@ import greenlet
 import pytest
 from benchmarks import soak
 
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, joint_env, single_env
 from simenv_marl.core.plans.options import Options
 from simenv_marl.errors import ClosedError, InvalidActionError
 from tests.core.test_threads import in_a_thread
 from tests.processes import alone
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import alive, begun, decision, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
-ALL_VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 decide = decision()
 
@@ -39,7 +39,7 @@ def ended_by(trigger, held):
 # -- ends in mid-episode --------------------------------------------------------------------------
 
 
-@ALL_VIEWS
+@EVERY_VIEW
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
 def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(
@@ -124,7 +124,7 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
 
 
 @pytest.mark.usefixtures("_collected")
-@ALL_VIEWS
+@EVERY_VIEW
 @pytest.mark.parametrize(
     "when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"]
 )

@@ -17,12 +17,12 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import Script, begun, calling, decision, decisions, define, plainly, play
 
 PUMP, FAN = decision(agent="pump_0"), decision(agent="fan_0")
 NAMED = define(agent=lambda name: name)(lambda name: "rule")
 BOTH = calling(PUMP, FAN, PUMP)
-EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 
 
 # -- what is made ---------------------------------------------------------------------------------
@@ -50,15 +50,15 @@ def test_generate_env_returns_a_class_of_a_view(points, options, base):
 
 
 @EVERY_VIEW
-def test_environments_have_spaces_of_their_own(make):
+def test_environments_have_spaces_of_their_own(view):
     seeing, acting = spaces.Box(0, 1, (3,), np.float32), spaces.Discrete(4)
     pump = decision(observation_space=seeing, action_space=acting, agent="pump_0")
-    env, other = (make(calling(pump), pump) for _ in range(2))
+    env, other = (view(calling(pump), pump) for _ in range(2))
 
     def spaces_of(env):
-        if make is single_env:
+        if view is single_env:
             return env.observation_space, env.action_space
-        if make is joint_env:
+        if view is joint_env:
             return env.observation_space["pump_0"], env.action_space["pump_0"]
         return env.observation_space("pump_0"), env.action_space("pump_0")
 
@@ -81,14 +81,14 @@ class Rendering(Script):
 
 
 @EVERY_VIEW
-def test_environments_have_metadata_and_a_generator(make):
-    plain = make(calling(PUMP), PUMP)
+def test_environments_have_metadata_and_a_generator(view):
+    plain = view(calling(PUMP), PUMP)
     assert (
         plain.metadata["render_fps"],
         list(plain.metadata["render_modes"]),
         plain.render_mode,
     ) == (4, [], None)
-    env = make(Rendering, PUMP)
+    env = view(Rendering, PUMP)
     assert str(env)
     assert env.unwrapped is env
     assert isinstance(env.simulation, Rendering)
@@ -96,7 +96,7 @@ def test_environments_have_metadata_and_a_generator(make):
     made = generate_env(Rendering, PUMP)  # which Gymnasium asks as a class
     for metadata in (env.metadata, made.metadata):
         assert (metadata["render_fps"], metadata["render_modes"]) == (0.5, ["ansi", "rgb_array"])
-    assert env.metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(make)
+    assert env.metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(view)
     env.reset(seed=3)
     assert env.unwrapped.np_random_seed == 3
     assert env.unwrapped.np_random.random() == np.random.default_rng(3).random()
@@ -142,14 +142,8 @@ def test_environments_have_metadata_and_a_generator(make):
     ids=plainly,
 )
 def test_options_that_cannot_be_are_refused(make, options, error, match):
-    with pytest.raises(error, match=match) as caught:
+    with pytest.raises(error, match=match):
         make(BOTH, PUMP, **options)
-    builtin = {
-        UnknownOptionError: TypeError,
-        OptionValueError: ValueError,
-        UnknownPointError: LookupError,
-    }[error]
-    assert isinstance(caught.value, builtin)
 
 
 def test_views_that_cannot_be_are_refused():

@@ -16,6 +16,7 @@ from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import Being, beings
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import begun, calling, decision, decisions, follow_the_rule, play, script
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
@@ -38,9 +39,8 @@ def test_observations_that_do_not_fit_are_errors(view, space, value, at):
     observed = [*[space.sample()] * at, value]
     decide = decision(observation_space=space, observation_space_mapping=lambda: observed.pop(0))
     env = view(calling(decide, decide), decide)
-    with pytest.raises(ObservationError) as caught:
+    with pytest.raises(ObservationError):
         follow_the_rule(env)
-    assert isinstance(caught.value, ValueError)
     assert observed == []
 
 
@@ -171,7 +171,7 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
 # -- 5.4: rewards ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@EVERY_VIEW
 @pytest.mark.parametrize("before", [0, 1, 2], ids=["first", "second", "at the end"])
 @pytest.mark.parametrize(
     ("paid", "told"),
@@ -203,9 +203,8 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
         reward = reward_of_step()
         assert (reward, type(reward)) == (told, float)
     else:
-        with pytest.raises(RewardError, match=told) as caught:
+        with pytest.raises(RewardError, match=told):
             reward_of_step()
-        assert isinstance(caught.value, ValueError)
 
 
 # -- 5.6: the rule --------------------------------------------------------------------------------
@@ -305,9 +304,8 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
     for step, right in enumerate(legal):
         for action in illegal:
             before = env.last() if view is aec_env else None
-            with pytest.raises(InvalidActionError, match="a_0") as caught:
+            with pytest.raises(InvalidActionError, match="a_0"):
                 env.step(action)
-            assert isinstance(caught.value, ValueError)
             assert len(moved) == len(env.simulation.log) == step
             if view is aec_env:
                 assert env.agent_selection == "a_0"

@@ -30,11 +30,9 @@ from simenv_marl.errors import (
 )
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import begun, calling, decision, define, play, step
 from tests.worlds.undone import registries_put_back
-
-EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-
 
 # -- goals ----------------------------------------------------------------------------------------
 
@@ -240,15 +238,15 @@ MASKED = {"action_mask_mapping": lambda: ONE_MASK}
     ],
     ids=["a mask", "choices", "a mask of several parts"],
 )
-def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, legal, log):
+def test_masked_actions_are_illegal_in_every_view(view, changes, mask, illegal, legal, log):
     ant = decision(agent="ant_0", **changes)
-    env = make(calling(ant, ant), ant)
+    env = view(calling(ant, ant), ant)
     result = env.reset(seed=1)
-    if make is joint_env:
+    if view is joint_env:
         given = result[1]["action_mask"]["ant_0"]
     else:
-        infos = env.infos if make is aec_env else result[1]
-        given = (infos if make is single_env else infos["ant_0"])["action_mask"]
+        infos = env.infos if view is aec_env else result[1]
+        given = (infos if view is single_env else infos["ant_0"])["action_mask"]
     parts = given if len(mask) > 1 else (given,)
     assert [part.tolist() for part in parts] == mask
     assert {part.dtype for part in parts} == {np.dtype(np.int8)}
@@ -376,10 +374,10 @@ def told(env):
 
 @EVERY_VIEW
 @pytest.mark.parametrize("rate", [0.25, 0, None])
-def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(make, rate):
+def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(view, rate):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
-    env = make(clock, ant, discount_rate=rate)
+    env = view(clock, ant, discount_rate=rate)
     for _ in range(2):
         infos = told(env)
         assert [(info["time"], info["elapsed"]) for info in infos] == [
@@ -517,9 +515,9 @@ class Ragged(Counted):
 
 
 @EVERY_VIEW
-def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
+def test_the_state_is_a_copy_of_the_simulations_in_its_space(view):
     ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
-    env = make(lambda: Counted(ant), ant)
+    env = view(lambda: Counted(ant), ant)
     assert env.state_space is None
     env.reset()
     state = env.state()
@@ -529,7 +527,7 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     assert state.tolist() == [1, 4]
     state[:] = 9
     assert env.simulation.numbers.tolist() == [1, 4]
-    env = make(lambda: Counted(ant), ant, state_space=space)
+    env = view(lambda: Counted(ant), ant, state_space=space)
     assert env.state_space == space
     env.reset()
     assert env.state().dtype == np.float32
@@ -593,10 +591,10 @@ def test_the_state_may_be_what_all_observe(make):
 
 
 @EVERY_VIEW
-def test_the_simulation_renders_in_its_modes(make, capsys):
+def test_the_simulation_renders_in_its_modes(view, capsys):
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
-        make(lambda: Counted(ant), ant, render_mode=mode)
+        view(lambda: Counted(ant), ant, render_mode=mode)
         for mode in ("ansi", "rgb_array", "human", None)
     )
     assert ansi.render_mode == "ansi"

@@ -1,7 +1,6 @@
 """Agents that are entities: their names, rosters, births and deaths."""
 
 import re
-from collections import Counter
 from weakref import ref
 
 import pytest
@@ -35,12 +34,12 @@ from tests.worlds.many_worlds import (
     Being,
     Colony,
     Other,
-    answer,
     being_of,
     beings,
     colony,
     designs,
     others,
+    played,
     seeds,
 )
 from tests.worlds.models import (
@@ -569,36 +568,6 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 
 # -- everything at once ---------------------------------------------------------------------------
-
-
-def played(env, seed):
-    """Play a colony; check PettingZoo's books at every step.
-
-    Returns who decided, the totals and the ends.
-    """
-    env.reset(seed=seed)
-    decided, totals, ends = [], Counter(), {}
-    booked = Counter(env.rewards)
-    for agent in env.agent_iter():
-        assert agent not in ends
-        assert agent in env.agents
-        assert len(set(env.agents)) == len(env.agents)
-        for book in (env.rewards, env.terminations, env.truncations, env.infos):
-            assert set(book) == set(env.agents)
-        observation, reward, terminated, truncated, _ = env.last()
-        assert observation in env.observation_space(agent)
-        totals[agent] += reward
-        assert type(reward) is float
-        assert type(terminated) is type(truncated) is bool
-        if terminated or truncated:
-            ends[agent] = (terminated, truncated)
-            env.step(None)
-        else:
-            env.step(answer(seed, agent, decided.count(agent)))
-            decided.append(agent)
-        booked.update(env.rewards)
-    assert {a: t for a, t in booked.items() if t} == {a: t for a, t in totals.items() if t}
-    return decided, totals, ends
 
 
 @given(designs, seeds)

@@ -33,6 +33,7 @@ from simenv_marl.errors import (
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import begun, calling, decision, play
 
 NAMES = ("player_red", "player_blue")
@@ -380,7 +381,7 @@ def flown(make, space, action, *, clip_actions=True):
     return taken[-1]
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@EVERY_VIEW
 @pytest.mark.parametrize(
     ("space", "action", "expected"),
     [
@@ -396,12 +397,12 @@ def flown(make, space, action, *, clip_actions=True):
     ],
 )
 def test_actions_outside_a_box_are_clipped_with_the_option_alone(
-    make, space, action, expected
+    view, space, action, expected
 ) -> None:
-    taken = flown(make, space, action)
+    taken = flown(view, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
     with pytest.raises(InvalidActionError):
-        flown(make, space, action, clip_actions=False)
+        flown(view, space, action, clip_actions=False)
 
 
 @pytest.mark.parametrize(

@@ -138,9 +138,8 @@ class Lockable(Simulation):
     ids=plainly,
 )
 def test_objects_that_are_no_simulation_are_refused(source):
-    with pytest.raises(SimulationError, match="simulation") as caught:
+    with pytest.raises(SimulationError, match="simulation"):
         single_env(source, Model.decide)
-    assert isinstance(caught.value, TypeError)
 
 
 # -- seeds and options ----------------------------------------------------------------------------
@@ -273,9 +272,8 @@ def test_stop_is_called_to_unwind_and_only_then():
 def test_an_episode_without_a_decision_is_an_error(make):
     decide, calls = decision(), []
     env = make(script(lambda simulation: [call() for call in calls]), decide)
-    with pytest.raises(NoDecisionError, match="without a decision") as caught:
+    with pytest.raises(NoDecisionError, match="without a decision"):
         env.reset()
-    assert isinstance(caught.value, RuntimeError)
     with pytest.raises(NotResetError, match="no episode yet"):
         env.step(1)
     calls.append(decide)

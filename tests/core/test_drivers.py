@@ -18,6 +18,7 @@ from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.processes import run_code
+from tests.worlds.marks import EVERY_DRIVER
 from tests.worlds.models import (
     Script,
     begun,
@@ -48,8 +49,8 @@ def _nobody_is_running_afterwards():
 # -- 5.0: one stack of its own, kept over the episodes --------------------------------------------
 
 
-@DRIVERS
-def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver):
+@EVERY_DRIVER
+def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context():
     variable = contextvars.ContextVar("variable", default="nobody's")
     seen = []
 
@@ -82,7 +83,7 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
             look()
 
     decide = decision()
-    env = single_env(Engine, decide, driver=driver)
+    env = single_env(Engine, decide)
     for user in ("one", "two", "after it was closed"):
         token = variable.set(user)
         for _ in range(2):
@@ -112,9 +113,9 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
 # -- threads --------------------------------------------------------------------------------------
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
+def test_other_threads_run_rules_and_environments_meanwhile(inner):
     decide, other = decision(), decision(lambda: "its rule")
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
@@ -129,7 +130,7 @@ def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
             lambda: in_a_thread(other),  # which is no point of the environment
             lambda: in_a_thread(use),
         ]
-        env = begun(single_env(calling(decide, *functions, decide), decide, driver=driver))
+        env = begun(single_env(calling(decide, *functions, decide), decide))
         env.step(1)
         env.step(2)
     assert env.simulation.log == [1, "rule", "its rule", [(1.0, False), (1.0, True), [1, 2]], 2]
@@ -148,10 +149,10 @@ WAYS = {
 }
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
+def test_decisions_in_threads_of_the_model_fail_the_step(way, last):
     def work():
         roots.append(weakref.ref(greenlet.getcurrent()))
         decide()
@@ -165,7 +166,7 @@ def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
             simulation.log.append(decide())
 
     roots, decide = [], decision()
-    env = begun(single_env(script(main), decide, driver=driver), 5)
+    env = begun(single_env(script(main), decide), 5)
     with pytest.raises(WrongThreadError, match=REFUSED) as caught:
         env.step(1)
     assert env.simulation.log == [1, "refused"]
@@ -179,8 +180,8 @@ def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
     assert root() is None or not gc.get_referrers(root())
 
 
-@DRIVERS
-def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
+@EVERY_DRIVER
+def test_a_refusal_is_raised_once_or_noted_on_another_error():
     def passed_on():
         return by_pool(decide)
 
@@ -191,7 +192,7 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
 
     decide = decision()
     for function, kind in ((passed_on, WrongThreadError), (followed_by_another, KeyError)):
-        env = begun(single_env(calling(decide, function), decide, driver=driver))
+        env = begun(single_env(calling(decide, function), decide))
         with pytest.raises(kind) as caught:
             env.step(1)
         env.close()
@@ -203,9 +204,9 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
             assert len(caught.value.__notes__) == 1
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
-def test_decisions_in_threads_older_than_the_episode_are_refused(driver, how):
+def test_decisions_in_threads_older_than_the_episode_are_refused(how):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)
@@ -224,7 +225,7 @@ def test_decisions_in_threads_older_than_the_episode_are_refused(driver, how):
         decide()
 
     decide = decision()
-    env = single_env(Hiring, decide, driver=driver)
+    env = single_env(Hiring, decide)
     for _ in range(1 if how == "close" else 2):  # after a close the threads are those of nobody
         assert env.simulation.ask() == "rule"  # between episodes nobody would be asked anyway
         env.reset()

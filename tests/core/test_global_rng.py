@@ -6,8 +6,9 @@ import threading
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import RULE, TRUNCATED, aec_env, simulate
 from simenv_marl.errors import OptionValueError, WrongThreadError
+from tests.worlds.marks import EVERY_DRIVER, EVERY_VIEW
 from tests.worlds.models import begun, define, play
 
 
@@ -37,7 +38,6 @@ class Casino:
         return random.choice("abc") + str(np.random.randint(100))
 
 
-DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 BET = f"{__name__}.Casino.bet"
 POINTS = {
     BET: define(
@@ -72,14 +72,11 @@ def plain(seed):
     return casino.log
 
 
-@DRIVERS
-@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
+@EVERY_DRIVER
+@EVERY_VIEW
+def test_environments_draw_as_plain_runs_do_whatever_else_draws(view):
     logs = {seed: plain(seed) for seed in (7, 8)}
-    envs = {
-        seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver)
-        for seed in logs
-    }
+    envs = {seed: view(Casino, {BET: define(agent="player_0")}, global_rng=True) for seed in logs}
 
     def assert_untouched(move, *args, **kwargs):
         before = world()
@@ -155,18 +152,16 @@ def test_other_bit_generators_of_the_user_stay():
     assert env.simulation.log == plain(7)
 
 
-@DRIVERS
-def test_one_environment_in_the_rule_of_another(driver):
+@EVERY_DRIVER
+def test_one_environment_in_the_rule_of_another():
     """The state of the outer one is in place in its simulation's thread, too."""
 
     class Gambler(Casino):
         def run(self):
-            self.inner = simulate(
-                Casino, points=POINTS, seed=self.seed, global_rng=True, driver=driver
-            )
+            self.inner = simulate(Casino, points=POINTS, seed=self.seed, global_rng=True)
             return super().run()
 
-    outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True, driver=driver)
+    outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True)
     assert outer.inner.log == outer.log == plain(3)
 
 

@@ -22,10 +22,10 @@ from tests.worlds.many_worlds import (
     Announcing,
     Answered,
     Colony,
-    answer,
     beings,
     colony_points,
     designs,
+    played,
     seeds,
 )
 from tests.worlds.models import begun, decision, script
@@ -46,35 +46,26 @@ def is_blank(env, agent, observation):
 @settings(deadline=None)
 @given(EVERYBODY)
 def test_padded_aec_selects_live_agents_only(world):
-    design, seed, kind = world
-    env = begun(colony(design, kind, aec_env, padded=True), seed)
-    everybody = list(env.possible_agents)
-    paid, booked, decided = dict.fromkeys(everybody, 0.0), dict.fromkeys(everybody, 0.0), []
-    for agent in env.agent_iter():
-        _, reward, terminated, truncated, info = env.last()
-        paid[agent] += reward
-        assert {tuple(info) for info in env.infos.values()} == {("present",)}
-        if terminated or truncated:
-            assert (terminated, truncated) == (not design.truncates, design.truncates)
-            env.step(None)
-            continue
-        assert sorted(env.agents) == sorted(everybody)
-        assert info["present"] is True
+    def look(agent):
+        assert sorted(env.agents) == everybody
+        assert env.infos[agent] == {"present": True}
         for other in everybody:
             assert not env.terminations[other]
             assert not env.truncations[other]
+            assert set(env.infos[other]) == {"present"}
             assert env.infos[other]["present"] or is_blank(env, other, env.observe(other))
-        env.step(answer(seed, agent, decided.count(agent)))
-        decided.append(agent)
-        for other, value in env.rewards.items():
-            booked[other] += value
-    assert env.possible_agents == everybody
+
+    design, seed, kind = world
+    env = colony(design, kind, aec_env, padded=True)
+    everybody = sorted(env.possible_agents)
+    decided, totals, ends = played(env, seed, look)
+    assert sorted(env.possible_agents) == everybody
     assert env.agents == []
     plain = Answered(design, seed)
     assert decided == plain.decisions
     assert env.simulation.trace == plain.trace
-    assert paid == dict.fromkeys(everybody, 0.0) | plain.totals
-    assert booked == paid  # each reward stands in ``rewards`` once, after the step that brings it
+    assert totals == dict.fromkeys(everybody, 0.0) | plain.totals
+    assert ends == dict.fromkeys(everybody, (not design.truncates, design.truncates))
 
 
 @settings(deadline=None)

@@ -19,9 +19,9 @@ from simenv_marl.decision import decision_points
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
-from tests.conftest import DRIVERS
 from tests.processes import run_code
 from tests.worlds.many_worlds import Colony, Design, colony_points
+from tests.worlds.marks import EVERY_DRIVER
 from tests.worlds.models import play
 from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some
 from tests.worlds.undone import fails
@@ -74,7 +74,7 @@ def by_number(observation):
 
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
-@pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
+@EVERY_DRIVER
 @pytest.mark.parametrize("options", [{}, {"max_steps": 5}], ids=str)
 @pytest.mark.parametrize("batched", [False, True])
 def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched, options):

@@ -8,6 +8,7 @@ the library, and notes what must come of it.
 from __future__ import annotations
 
 import random
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -311,3 +312,34 @@ def advised(observation: Any, seed: int) -> Any:
     """The answer of whoever makes that observation."""
     number, decided = int(observation[0]), int(observation[1])
     return answer(seed, f"creature_{number}" if number >= 0 else "overseer_0", decided)
+
+
+def played(env, seed, look=lambda agent: None):
+    """Play a colony; check PettingZoo's books at every step, and look at each decision.
+
+    Returns who decided, the totals and the ends.
+    """
+    env.reset(seed=seed)
+    decided, totals, ends = [], Counter(), {}
+    booked = Counter(env.rewards)
+    for agent in env.agent_iter():
+        assert agent not in ends
+        assert agent in env.agents
+        assert len(set(env.agents)) == len(env.agents)
+        for book in (env.rewards, env.terminations, env.truncations, env.infos):
+            assert set(book) == set(env.agents)
+        observation, reward, terminated, truncated, _ = env.last()
+        assert observation in env.observation_space(agent)
+        totals[agent] += reward
+        assert type(reward) is float
+        assert type(terminated) is type(truncated) is bool
+        if terminated or truncated:
+            ends[agent] = (terminated, truncated)
+            env.step(None)
+        else:
+            look(agent)
+            env.step(answer(seed, agent, decided.count(agent)))
+            decided.append(agent)
+        booked.update(env.rewards)
+    assert {a: t for a, t in booked.items() if t} == {a: t for a, t in totals.items() if t}
+    return decided, totals, ends

@@ -2,7 +2,7 @@
 
 import pytest
 
-from simenv_marl import RULE, parallel_env, single_env
+from simenv_marl import RULE, parallel_env
 from tests.worlds.models import calling, decision
 
 
@@ -46,11 +46,3 @@ def test_every_callable_gets_the_bound_arguments_of_calls_that_bind():
     with pytest.raises(TypeError, match=r"missing 1 required positional argument: 'x'"):
         parallel_env(calling(lambda: choose(y=1)), choose).reset()
     assert seen == {}
-
-
-def test_the_end_is_observed_with_the_arguments_of_the_last_call():
-    last = decision(lambda x, *, z: 0, observation_space_mapping=lambda x, *, z: [x, z])
-    env = single_env(calling(lambda: last(1, z=4), lambda: last(2, z=5)), last)
-    env.reset()
-    env.step(1)
-    assert env.step(1)[0].tolist() == [2, 5]

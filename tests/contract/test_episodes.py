@@ -155,7 +155,9 @@ def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity
 
 
 def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_its_space():
-    space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9))
+    dials = spaces.MultiDiscrete([2, 2], start=[-5, -1])
+    parts = spaces.Tuple([dials, spaces.MultiBinary(2)])
+    space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9), c=parts)
     other = decision(agent="other_0")
     late = decision(agent="late_0", observation_space=space, observation_space_mapping=space.sample)
     env = aec_env(calling(other, late), [other, late])
@@ -163,7 +165,8 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
         env.reset()
         for _ in range(2):
             observation = env.observe("late_0")
-            assert same(observation, {"a": np.float32([1]), "b": np.int64(-7)})
+            parts = np.array([-4, 0]), np.zeros(2, np.int8)
+            assert same(observation, {"a": np.float32([1]), "b": np.int64(-7), "c": parts})
             fill(observation)
         env.step(1)
 

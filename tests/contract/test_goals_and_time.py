@@ -400,14 +400,6 @@ def test_rates_that_do_not_discount_are_refused(rate):
         aec_env(lambda: Clock(end=1), decision(agent="ant_0"), discount_rate=rate)
 
 
-def test_a_rate_needs_a_simulation_that_has_a_time():
-    ant = decision(agent="ant_0")
-    env = aec_env(calling(ant), ant, discount_rate=0.1)
-    for _ in range(2):
-        with pytest.raises(OptionValueError, match=r"has no method time\(\); add one"):
-            env.reset()
-
-
 # -- infos ----------------------------------------------------------------------------------------
 
 

@@ -419,8 +419,6 @@ def test_dicts_from_functions_work_while_environments_live():
     assert simulate(env.simulation, {Trader.bid: lambda _: 4}, points=changed).log == [4]
     with pytest.raises(UnknownPointError, match="was named twice"):
         aec_env(calling(Trader), {BID: define(), Trader.bid: define()})
-    with pytest.raises(UnknownPointError, match="was named twice"):
-        aec_env(calling(Trader), [Home.heat, Home.heat])
 
 
 # -- quick rewards --------------------------------------------------------------------------------

@@ -131,7 +131,7 @@ def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
 
 def test_clones_have_many_generations_and_end_when_they_are_collected():
     twin, numbers = clone(trip(), method="fork"), []
-    for _ in range(150):
+    for _ in range(30):
         numbers.append(number_of(twin))
         twin = clone(twin, method="fork")
     assert all(map(gone, numbers))
@@ -524,7 +524,7 @@ def test_a_closed_link_of_a_chain_of_clones_is_freed():
     twin = clone(trip(), method="fork")
     depth = twin.call(lambda env: len(inspect.stack()))
     links = []
-    for _ in range(300):
+    for _ in range(40):
         links.append((weakref.ref(twin.unwrapped), weakref.ref(twin.unwrapped.session._fork)))
         deeper = clone(twin, method="fork")
         twin.close()

@@ -4,17 +4,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
 
 from simenv_marl.core.plans.options import Options
 
 ROOT = Path(__file__).parents[1]
 
 
-def python(*words: object, status: int = 0, **options: Any) -> subprocess.CompletedProcess[Any]:
+def python(*words, status=0, **options):
     """Run Python where it finds the library and the tests, until it ends with that status."""
     path = os.pathsep.join([*filter(None, sys.path), str(ROOT)])
     given = {
@@ -30,7 +28,7 @@ def python(*words: object, status: int = 0, **options: Any) -> subprocess.Comple
     return done
 
 
-def alone(function: Callable[..., None], *arguments: Any) -> None:
+def alone(function, *arguments):
     """Call a function of a test file in a fresh process, without open resources of other tests.
 
     Environments have the driver of the test that calls. The arguments are strings and numbers.
@@ -47,7 +45,7 @@ Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or
     python("-c", code)
 
 
-def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
+def run_code(*parts, status=0, options=()):
     """Run code in a process of its own, which ends with that status; return what it has printed.
 
     One that ends well prints no errors; one that hangs is ended.
@@ -57,7 +55,7 @@ def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
     return str(done.stdout)
 
 
-def descriptors() -> dict[str, str]:
+def descriptors():
     """What this process has open: the descriptors, and what they lead to."""
     found = {}
     for number in os.listdir("/proc/self/fd"):
@@ -68,7 +66,7 @@ def descriptors() -> dict[str, str]:
     return found
 
 
-def runs(number: int) -> bool:
+def runs(number):
     """Whether a process runs, and is no zombie."""
     try:
         os.kill(number, 0)
@@ -82,7 +80,7 @@ def runs(number: int) -> bool:
         return False
 
 
-def gone(number: int) -> bool:
+def gone(number):
     """Whether a process ends within a generous time, for busy machines."""
     until = time.monotonic() + 60
     while runs(number) and time.monotonic() < until:

@@ -5,7 +5,6 @@ import weakref
 from functools import partial
 from itertools import repeat
 from types import MethodType, SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +43,7 @@ def test_observations_that_do_not_fit_are_errors(view, space, value, at):
     assert observed == []
 
 
-def fill(observation: Any) -> None:
+def fill(observation):
     """Overwrite everything that can be overwritten."""
     if isinstance(observation, dict):
         for value in observation.values():

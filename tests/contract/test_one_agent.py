@@ -139,7 +139,7 @@ def episode(env):
     [(None, [1, 3, 1, 2, 1, 1]), ({"player_blue": lambda observation: 0}, [1] * 6)],
     ids=["their rule", "policies"],
 )
-def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) -> None:
+def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves):
     env = single_env(Game, MOVE, agent="player_red", policies=policies)
     steps, offers = episode(env)
     assert offers == [1, 3, 1, 2, 1, 1]
@@ -150,7 +150,7 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) ->
         env.step(0)
 
 
-def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
+def test_an_agent_with_a_name_of_its_own_is_one_of_several_points():
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
     env = begun(
         single_env(
@@ -167,7 +167,7 @@ def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     assert env.simulation.log == [(5, 1), (5, 1)]
 
 
-def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> None:
+def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs():
     named = {
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
@@ -180,7 +180,7 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> N
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did() -> None:
+def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did():
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
@@ -237,12 +237,12 @@ def simulated(simulation, points, **options):
 )
 def test_only_the_single_view_takes_an_agent_and_needs_one_of_many(
     make, simulation, points, options, error, match
-) -> None:
+):
     with pytest.raises(error, match=match):
         make(simulation, points, **options)
 
 
-def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
+def test_all_that_makes_single_views_takes_the_name_of_the_agent():
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
@@ -258,7 +258,7 @@ def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
 # -- skip_forced= ---------------------------------------------------------------------------------
 
 
-def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> None:
+def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up():
     steps, _ = episode(single_env(Game, MOVE, agent="player_red"))
     env = single_env(Game, MOVE, agent="player_red", skip_forced=True)
     skipped, offers = episode(env)
@@ -270,7 +270,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> 
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
+def test_forced_moves_ask_neither_the_user_nor_a_policy():
     asked = []
 
     def policy(observation, info):
@@ -293,7 +293,7 @@ def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
     assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
-def test_in_rounds_forced_moves_use_no_action() -> None:
+def test_in_rounds_forced_moves_use_no_action():
     env, joint = parallel_env(Game, MOVE, **ROSTER), joint_env(Game, MOVE, **ROSTER)
     env.reset(seed=0)
     joint.reset(seed=0)
@@ -324,7 +324,7 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
     ],
     ids=["a space of one action", "several parts"],
 )
-def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
+def test_there_are_forced_moves_without_choices(changes, asked, moves):
     points = {f"{PLACE}.move": definition(choices=None, **changes)}
     env = begun(single_env(Game, points, agent="player_red", skip_forced=True), 0)
     for action in asked:
@@ -332,7 +332,7 @@ def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
     assert moves_of(env, "player_red") == moves
 
 
-def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
+def test_an_episode_of_forced_moves_alone_ends_at_the_first_step():
     env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
     for _ in range(2):
         observation, _ = env.reset(seed=0)
@@ -396,9 +396,7 @@ def flown(make, space, action, *, clip_actions=True):
         ),
     ],
 )
-def test_actions_outside_a_box_are_clipped_with_the_option_alone(
-    view, space, action, expected
-) -> None:
+def test_actions_outside_a_box_are_clipped_with_the_option_alone(view, space, action, expected):
     taken = flown(view, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
     with pytest.raises(InvalidActionError):
@@ -422,12 +420,12 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_actions_that_cannot_be_clipped_are_refused(space, wrong) -> None:
+def test_actions_that_cannot_be_clipped_are_refused(space, wrong):
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 
 
-def test_the_vector_view_clips_as_the_single_view_does() -> None:
+def test_the_vector_view_clips_as_the_single_view_does():
     two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
     assert same(
@@ -440,7 +438,7 @@ def test_the_vector_view_clips_as_the_single_view_does() -> None:
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
+def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round():
     """The first being has no choice and is out before the second one is asked."""
     program = (
         "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2,"
@@ -466,7 +464,7 @@ def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or
 
 
 @pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
-def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
+def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies):
     program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
     env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):

@@ -1,7 +1,6 @@
 """Sections 2 and 5.1 of the contract: how a simulation is made, reset, seeded and ended."""
 
 import threading
-from typing import Any
 
 import numpy as np
 import pytest
@@ -145,7 +144,7 @@ def test_objects_that_are_no_simulation_are_refused(source):
 # -- seeds and options ----------------------------------------------------------------------------
 
 
-def recording(reset_of: Any) -> Any:
+def recording(reset_of):
     class Recording:
         def __init__(self):
             self.got = []

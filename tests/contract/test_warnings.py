@@ -86,7 +86,7 @@ def play(env, draw=lambda: None):
     ],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
-def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset) -> None:
+def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset):
     kind = gambler(draw, in_reset=in_reset)
     for make in (single_env, aec_env):
         for _ in range(2):
@@ -104,12 +104,12 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
     ),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-def test_all_runners_warn(heard_alone, run) -> None:
+def test_all_runners_warn(heard_alone, run):
     run(gambler(random.random))
     assert len(heard_alone(DRAWS)) == 1
 
 
-def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard) -> None:
+def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard):
     def draw():
         return random.random() + np.random.random()
 
@@ -128,7 +128,7 @@ def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard) -> None:
     assert heard(DRAWS) == []
 
 
-def test_draws_of_other_threads_cause_no_warning(heard) -> None:
+def test_draws_of_other_threads_cause_no_warning(heard):
     over, draws_going_on = threading.Event(), threading.Event()
 
     def draw():
@@ -173,7 +173,7 @@ ANTS = hill("ant_0", "ant_1")
 )
 def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(
     heard, options, absent
-) -> None:
+):
     env = aec_env(ANTS, ant, **options)
     for _ in range(2):
         play_in_turns(env, seed=1)
@@ -184,7 +184,7 @@ def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode
     assert "ant_0, ant_1" in those_who_came
 
 
-def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
+def test_runners_tell_of_it_once_for_all_simulations(heard):
     policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
     simulate_many(ANTS, policies, seeds=range(5), points=ant)
     assert len(heard(ABSENT)) == 1
@@ -192,7 +192,7 @@ def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
     assert len(heard(ABSENT)) == 2
 
 
-def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> None:
+def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard):
     names = ["nest.1", "ant_0"]  # a dot makes no path
     play_in_turns(
         aec_env(
@@ -210,7 +210,7 @@ def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> N
 
 
 @pytest.mark.parametrize("slip", ["threading.Thread.strat", f"{__name__}.Missing.step"])
-def test_policies_for_names_without_a_function_are_refused(slip) -> None:
+def test_policies_for_names_without_a_function_are_refused(slip):
     with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
         aec_env(ANTS, ant, policies={slip: lambda observation: 0})
 
@@ -218,7 +218,7 @@ def test_policies_for_names_without_a_function_are_refused(slip) -> None:
 # -- rounds that stand still ----------------------------------------------------------------------
 
 
-def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> None:
+def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard):
     env = begun(parallel_env(ANTS, ant, possible_agents=["ant_0", "ant_1"]), 1)
     for number in range(150):
         env.step({"ant_1": 1} if number % 2 else {})
@@ -230,7 +230,7 @@ def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> 
     assert env.agents == []
 
 
-def test_turns_are_no_standstill(heard) -> None:
+def test_turns_are_no_standstill(heard):
     one, two = decision(agent="one"), decision(agent="two")
     env = begun(parallel_env(calling(*[one, two] * 400), [one, two]), 1)
     for number in range(600):
@@ -278,7 +278,7 @@ OVERRIDE = "objects of these classes are no agents"
 DRAIN = f"{__name__}.Tank.drain"
 
 
-def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard) -> None:
+def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard):
     env = begun(aec_env(tanks(Tank, Deaf), {DRAIN: define()}))
     env.step(1)
     assert not heard(OVERRIDE)
@@ -292,7 +292,7 @@ def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard)
     assert not hasattr(Deaf.drain, "__wrapped__")
 
 
-def test_a_static_function_that_overrides_a_point_is_warned_of(heard) -> None:
+def test_a_static_function_that_overrides_a_point_is_warned_of(heard):
     model = calling(lambda: Tank.fill(1), lambda: Deaf.fill(2))
     assert simulate(model, {}, points={f"{__name__}.Tank.fill": define()}).log == ["rule", "deaf"]
     assert not heard(OVERRIDE)  # the rule decides everywhere
@@ -310,12 +310,12 @@ def test_a_static_function_that_overrides_a_point_is_warned_of(heard) -> None:
         (tanks(Tank, Deaf), {DRAIN: define(), f"{__name__}.Deaf.drain": define()}),
     ],
 )
-def test_an_override_that_decides_is_not_warned_of(model, points, heard) -> None:
+def test_an_override_that_decides_is_not_warned_of(model, points, heard):
     play_in_turns(aec_env(model, points), 1)
     assert not heard(OVERRIDE)
 
 
-def test_an_override_may_run_in_a_thread_of_the_model(heard) -> None:
+def test_an_override_may_run_in_a_thread_of_the_model(heard):
     def main(simulation):
         thread = threading.Thread(target=lambda: simulation.log.append(Deaf().drain()))
         thread.start()
@@ -330,7 +330,7 @@ def test_an_override_may_run_in_a_thread_of_the_model(heard) -> None:
 # -- names of agents, and functions that end them -------------------------------------------------
 
 
-def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard) -> None:
+def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard):
     for ending, expected in [("1 ends", 0), ("1 ends, 1 ends", 0), ("7 ends, 8 ends", 1)]:
         env = aec_env(life(f"0 acts, 1 acts, {ending}, 0 acts"), beings())
         play_in_turns(env, 1)
@@ -341,7 +341,7 @@ def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard) -> None:
     assert "these have: being_0, being_1" in texts[0]
 
 
-def test_declared_agents_may_end_before_they_decide(heard) -> None:
+def test_declared_agents_may_end_before_they_decide(heard):
     roster = ["being_0", "being_1", "being_2"]
     env = aec_env(life("0 acts, 1 acts, 2 ends, 0 acts"), beings(), possible_agents=roster)
     play_in_turns(env, 1)
@@ -351,7 +351,7 @@ def test_declared_agents_may_end_before_they_decide(heard) -> None:
 PAIR, DYING = life("0 acts, 1 acts, 0 acts"), life("0 acts, 1 acts, 1 leaves, 0 acts")
 
 
-def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard) -> None:
+def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard):
     env = aec_env(PAIR, beings(agent=lambda being: "ant"))
     play_in_turns(env, 1)
     play_in_turns(env, 1)
@@ -363,7 +363,7 @@ def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard) -> N
 
 
 @pytest.mark.parametrize("deciders", [{}, {"one": lambda _: 1}])
-def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard) -> None:
+def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard):
     class Yard:
         def allot(self):
             return [0, 0, 0, 0]
@@ -391,7 +391,7 @@ LEAVE = f"{HERE}.Being.leave"
 
 @pytest.mark.parametrize("key", [Being.leave, LEAVE])
 @pytest.mark.parametrize("form", [lambda key: key, lambda key: [key], lambda key: {key: None}])
-def test_functions_that_end_agents_are_named_as_points_are(key, form, heard) -> None:
+def test_functions_that_end_agents_are_named_as_points_are(key, form, heard):
     env = aec_env(DYING, beings(removed_by=form(key)))
     for _ in range(2):
         assert story(play_in_turns(env, 1)) == "0 1 1+ 0 0+"
@@ -400,7 +400,7 @@ def test_functions_that_end_agents_are_named_as_points_are(key, form, heard) -> 
     assert len(play_in_turns(copied, 1)) == 5
 
 
-def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard) -> None:
+def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard):
     env = begun(aec_env(PAIR, beings()))
     env.close()
     assert not heard("removed_by= of")

@@ -374,7 +374,7 @@ def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, n
 @pytest.mark.filterwarnings(
     "ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
-def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None:
+def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations():
     """A loop that outlives its episodes keeps their tasks and passes on their exit later."""
     decide, raised = decision(), None
     env = single_env(lambda: Lasting(partial(gathered, clerk_of(decide))), decide)

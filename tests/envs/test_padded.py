@@ -1,7 +1,5 @@
 """Padded rosters: every possible agent is present, from the reset to the end of the episode."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import random

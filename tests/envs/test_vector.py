@@ -1,14 +1,11 @@
 """Many simulations at once tell what as many environments of their own tell."""
 
-from __future__ import annotations
-
 import copy
 import gc
 import multiprocessing
 import pickle
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -124,7 +121,7 @@ def test_the_view_can_be_chosen():
         vector_env(Voyage, num_envs=2, view="single")
 
 
-def seeds_of(envs: Any) -> list[int | None]:
+def seeds_of(envs):
     return [simulation.seed for simulation in envs.get_attr("simulation")]
 
 
@@ -200,7 +197,7 @@ def test_options_that_cannot_be_are_refused(options, error, match):
         vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
 
-def counts(envs: Any) -> list[int]:
+def counts(envs):
     return [simulation.count for simulation in envs.get_attr("simulation")]
 
 
@@ -306,7 +303,7 @@ def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
 )
 @pytest.mark.parametrize("culprit", [0, 2])
 def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, culprit):
-    def fail(thing: Any) -> Any:
+    def fail(thing):
         if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
             raise ZeroDivisionError
         return [0, 0] if where.startswith("obs") else 1
@@ -353,7 +350,7 @@ def test_a_failed_reset_or_a_closed_sub_environment_needs_a_full_reset():
 
 def test_sub_environments_are_closed_if_another_one_cannot_be_made():
     class Own(Counter):
-        def decide(self) -> Any:
+        def decide(self):
             return super().decide()
 
     plain, models = Own.decide, iter([Own(), Own(), Own()])
@@ -448,7 +445,7 @@ def test_an_error_of_one_simulation_lets_the_others_unwind():
     stacks_before = stacks()
 
     class Stubborn(Counter):
-        def run(self) -> Any:
+        def run(self):
             try:
                 super().run()
             finally:

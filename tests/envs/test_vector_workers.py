@@ -1,7 +1,5 @@
 """Simulations in several processes give the results of one process, and leave nothing behind."""
 
-from __future__ import annotations
-
 import gc
 import multiprocessing
 import os
@@ -10,8 +8,6 @@ import signal
 import threading
 import time
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +25,7 @@ from tests.worlds.undone import fails
 pytestmark = FORKS
 
 
-def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
+def workers(model=Counter, decision=None, **options):
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
     return vector_env(model, {POINT: decision or definition()}, **options)
 
@@ -45,10 +41,10 @@ def _nothing_is_left():
 class Failing(Counter):
     """Counts for ever; calls its reset's option for its seed after decisions and in unwinding."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.process = os.getpid()
 
-    def run(self) -> Any:
+    def run(self):
         try:
             while True:
                 self.count += self.decide()
@@ -56,7 +52,7 @@ class Failing(Counter):
         finally:
             self.call("unwinding")
 
-    def call(self, when: str) -> None:
+    def call(self, when):
         happens = (self.options or {}).get(when, {})
         if self.seed in happens:
             happens[self.seed]()
@@ -66,7 +62,7 @@ ONES = np.ones(4, np.int64)
 KILLED = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 
 
-def goes_on(envs: Any, seed: int = 0) -> None:
+def goes_on(envs, seed=0):
     envs.reset(seed=seed)
     assert [simulation.seed for simulation in envs.get_attr("simulation")] == [
         seed + place for place in range(4)
@@ -88,7 +84,7 @@ def test_async_vector_env_of_single_views_returns_the_same(kind, context, mode):
     theirs.close()
 
 
-def processes_of(envs: Any) -> list[int]:
+def processes_of(envs):
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
@@ -203,7 +199,7 @@ def test_a_second_close_ends_workers_that_an_interrupted_one_has_left(monkeypatc
 
 
 def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
-    def finish(path: Path) -> None:
+    def finish(path):
         time.sleep(0.3)
         path.touch()
 
@@ -232,10 +228,10 @@ def test_an_environment_closes_although_a_simulation_hangs(monkeypatch):
 def test_an_interrupted_step_leaves_the_workers_usable():
     home = os.getpid()
 
-    def interrupt(*_: Any) -> None:
+    def interrupt(*_):
         raise KeyboardInterrupt
 
-    def alarm() -> None:
+    def alarm():
         time.sleep(0.1)
         os.kill(home, signal.SIGALRM)
         time.sleep(0.3)
@@ -314,7 +310,7 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
     alone(start_in_vain, error)
 
 
-def start_in_vain(error: str) -> None:
+def start_in_vain(error):
     context, home = multiprocessing.get_context(FORK), os.getpid()
     start, started = context.Process.start, []
 

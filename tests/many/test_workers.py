@@ -298,7 +298,7 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
     alone(work_in_vain, what)
 
 
-def work_in_vain(what: str) -> None:
+def work_in_vain(what):
     loky, home = joblib.externals.loky, os.getpid()
 
     def refuse(process):

@@ -60,7 +60,7 @@ IN_MID_EPISODE = {
 }
 
 
-def patience(what: str) -> float:
+def patience(what):
     """For how long to wait for a simulator, in seconds: not long where no more comes."""
     if what == "slow updates":
         return 0.2
@@ -177,7 +177,7 @@ def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
         ProcessSimulation(["sleep", "600"], BOTH, timeout=1.0).reset()
 
 
-def in_a_fork(check) -> None:
+def in_a_fork(check):
     """Call a function that asserts something in a fork of this process."""
     process = multiprocessing.get_context("fork").Process(target=check)
     process.start()
@@ -230,7 +230,7 @@ def test_a_process_that_gets_one_pipe_of_two_gives_it_back(monkeypatch):
             os.fstat(end)
 
 
-def fail_many_times() -> None:
+def fail_many_times():
     """End processes in all ways in which they fail, and look for what is left open."""
     before = descriptors()
     for what in ("exit", "garbage", "silence"):
@@ -251,7 +251,7 @@ def test_a_killed_process_is_not_taken_for_one_that_exited_where_its_exit_code_i
     alone(ignore_children)
 
 
-def ignore_children() -> None:
+def ignore_children():
     """Kill a process whose exit code the system does not keep."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     env = begun(aec_env(reservoirs(), "reservoir.inflow"), 1)

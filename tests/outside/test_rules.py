@@ -22,7 +22,7 @@ pytestmark = pytest.mark.greenlet(
 )
 
 
-def telling(points=TELLING) -> ProcessSimulation:
+def telling(points=TELLING):
     """The reservoirs in a process that tells what its rules decide."""
     return ProcessSimulation(command("tells"), points)
 
@@ -125,16 +125,16 @@ GRAZE = make_step(
 )
 
 
-def line(frame) -> str:
+def line(frame):
     return frame if isinstance(frame, str) else json.dumps(frame)
 
 
-def both(*frames) -> str:
+def both(*frames):
     """Frames that are sent together."""
     return "\n".join(map(line, frames))
 
 
-def speaking(*frames) -> ProcessSimulation:
+def speaking(*frames):
     """A simulator that sends some frames or lines, whatever it receives."""
     return ProcessSimulation(
         [sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE}

@@ -194,9 +194,7 @@ def test_errors_surface_as_themselves(view, method):
 @METHODS
 @pytest.mark.parametrize("view", ["aec, padded", "parallel", "single, limited", "joint"])
 @pytest.mark.parametrize("options", [{}, LUCKY])
-def test_the_same_seed_is_the_same_future_of_clones_and_branches_and_nothing_else_moves(
-    view, options, method
-):
+def test_the_same_seed_gives_clones_and_branches_the_same_future(view, options, method):
     env, threaded = trip(view, **options), trip(view, driver="thread", **options)
     random.gauss(0, 1)  # the generators keep a second number
     np.random.standard_normal()

@@ -195,9 +195,7 @@ def test_only_functions_can_be_decided(function):
         ("weakest", lambda pump: pump.weakest(), ("class",), {}),
     ],
 )
-def test_mappings_of_static_and_class_methods_receive_the_arguments_bound_to_the_signature(
-    name, call, args, kwargs
-):
+def test_mappings_of_static_and_class_methods_receive_bound_arguments(name, call, args, kwargs):
     seen = []
 
     def observe(*args, **kwargs):
@@ -378,9 +376,7 @@ WATER, GO, ALSO_GO, GIVEN = (
         ([GO, GIVEN], ["go_1", "go_0"]),
     ],
 )
-def test_default_names_are_the_functions_letters_in_the_order_of_points_and_collide_with_none(
-    points, names
-):
+def test_default_names_are_the_functions_letters_and_never_collide(points, names):
     env = aec_env(calling(GO), points)
     assert env.possible_agents == names
     env.reset()

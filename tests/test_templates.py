@@ -147,7 +147,7 @@ def test_agents_of_the_mesa_template_are_born_and_die():
     assert set(ends.values()) == {True, False}
 
 
-def test_infos_of_the_simpy_template_tell_which_actions_are_legal_and_how_long_they_took():
+def test_infos_of_the_simpy_template_have_masks_and_elapsed_times():
     env = import_module("simenv_marl.testing.templates.simpy").env()
     _, info = env.reset(seed=7)
     assert info["action_mask"].sum() > 1  # a forced choice is not asked for

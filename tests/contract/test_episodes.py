@@ -130,7 +130,7 @@ def test_an_array_with_one_reference_to_it_is_copied(place):
     assert observe().tolist() == [1.0, 2.0]
 
 
-def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity_is_still_there():
+def test_observations_are_computed_at_each_decision_and_at_the_end():
     program = (
         "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health"
         " 6, 1 health 5, 2 forgotten"
@@ -153,7 +153,7 @@ def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity
     assert ended == {"being_0": ([0, 6], 6.0), "being_1": ([1, 5], 5.0), "being_2": ([2, 0], 0.0)}
 
 
-def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_its_space():
+def test_before_its_first_decision_an_agent_observes_a_blank():
     dials = spaces.MultiDiscrete([2, 2], start=[-5, -1])
     parts = spaces.Tuple([dials, spaces.MultiBinary(2)])
     space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9), c=parts)

@@ -136,7 +136,7 @@ def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
 # -- rosters --------------------------------------------------------------------------------------
 
 
-def test_declared_agents_are_there_from_the_start_and_those_who_have_decided_leave_first():
+def test_declared_agents_are_there_at_once_and_deciders_leave_first():
     roster = [*NAMES, "being_3"]
     env = aec_env(life("2 acts, 0 acts"), beings(), possible_agents=iter(roster))
     assert env.possible_agents == roster
@@ -264,7 +264,7 @@ def test_those_who_are_announced_join_if_their_decisions_are_the_users(
     assert env.simulation.log == log
 
 
-def test_announced_agents_that_never_decide_end_with_the_episode_or_when_they_are_removed():
+def test_announced_agents_that_never_decide_end_with_the_episode():
     program = life("0 acts, 2 health 8, 2 leaves, 1 acts, 3 health 4", announced=[1, 2, 3])
     turns = play(aec_env(program, beings()), 1)
     assert story(turns) == "0 2+ 1 0+ 1+ 3+"
@@ -432,7 +432,7 @@ class Young(Being):
         return "rule"
 
 
-def test_an_inherited_removal_ends_the_agents_of_all_points_of_a_subclass_and_of_that_alone():
+def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
     points = {
         Young.go: define(agent=lambda it: f"goer_{it.number}", removed_by=LEAVE),
         Young.come: define(agent=lambda it: f"comer_{it.number}", removed_by=LEAVE),
@@ -477,7 +477,7 @@ def test_removing_functions_work_as_before_outside_of_environments():
     assert (vars(Being)["leave"], vars(Being)["act"]) == (leave, act)
 
 
-def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation_runs_on():
+def test_the_single_view_ends_with_its_agent_and_the_simulation_runs_on():
     program = life("0 acts, 0 health 4, 0 leaves, 1 health 7", ends=TRUNCATED)
     env = begun(single_env(program, beings(agent="hero_0")))
     observation, *told = env.step(1)[:4]

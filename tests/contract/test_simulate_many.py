@@ -169,7 +169,7 @@ def test_policies_that_are_the_same_are_asked_together():
     assert asked == [10, 3, 3]
 
 
-def test_simulations_that_have_ended_are_collected_and_make_room_for_others_and_never_for_more():
+def test_simulations_that_have_ended_make_room_for_just_as_many_others():
     asked, under_way, ended = [], weakref.WeakSet(), []
 
     class Watched(Going):

@@ -73,7 +73,7 @@ PLAIN.reset(5)
 PLAIN.run()
 
 
-def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their_part_of_its_result():  # noqa: E501
+def test_items_decide_in_order_or_get_their_part_of_the_rules_result():
     env = aec_env(Day, points())
     day = follow_the_rule(env, seed=5)
     assert (day.log, day.grid.rules) == (PLAIN.log, 4)  # the rule runs once for a call

@@ -265,7 +265,7 @@ def test_the_number_of_seeds_is_that_of_the_paired_t_test(size, power, confidenc
     assert found.seeds_needed(size * apart.std(ddof=1), power=power)["b"] == np.ceil(expected)
 
 
-def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_wrong_ones_are_refused():  # noqa: E501
+def test_seeds_needed_are_bounded_and_wrong_differences_are_refused():
     returns = of_teams(a=[0, 0, 0], b=[1, 2, 3], same=[0, 0, 0])
     found = Evaluation(returns, "a", 0.95)
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):

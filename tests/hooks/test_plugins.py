@@ -155,7 +155,7 @@ def test_whatever_is_importable_can_be_extended(name, call, result, how, with_ha
 
 
 @EVERYWHERE
-def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(  # noqa: E501
+def test_handlers_of_a_position_run_in_order_and_their_changes_chain(
     with_handlers,
 ):
     function, seen = local(), []
@@ -453,7 +453,7 @@ def test_an_error_of_the_function_is_its_own_and_no_handler_runs_after_it(with_h
 
 
 @EVERYWHERE
-def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_it_returns(
+def test_handlers_of_a_generator_see_its_arguments_items_and_return(
     with_handlers,
 ):
     log = []
@@ -897,7 +897,7 @@ def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside(m
     assert log == [1, 2, 3]
 
 
-def test_generators_and_iterables_suspended_over_decisions_have_their_environments_plugins():
+def test_suspended_generators_have_the_plugins_of_their_environment():
     items, envs = expose_to_plugins([1, 2, 3]), {}
 
     @expose_to_plugins

@@ -295,7 +295,7 @@ def test_one_function_under_many_names_is_one_point(first):
 # -- environments of the same undecorated model ---------------------------------------------------
 
 
-def test_environments_of_the_same_undecorated_model_have_their_own_points_and_definitions():
+def test_environments_of_one_undecorated_model_have_their_own_definitions():
     other = decision()
     traders = calling(lambda: Trader().bid("tea"), other)
     one = aec_env(traders, {BID: define(action_space_mapping=lambda action: ("one", action))})
@@ -313,7 +313,7 @@ def test_environments_of_the_same_undecorated_model_have_their_own_points_and_de
     assert (one.possible_agents, two.possible_agents) == (["bid_0"], ["b_0"])
 
 
-def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_decorated():
+def test_local_classes_are_found_and_local_functions_must_be_decorated():
     class Local:
         def decide(self):
             return "rule"
@@ -330,7 +330,7 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
         aec_env(calling(decide), {decide: define()})
 
 
-def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(
+def test_threads_that_register_and_extend_functions_leave_each_other_alone(
     monkeypatch,
 ):
     def dawdle(hook, *args):

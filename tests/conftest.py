@@ -28,7 +28,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 DRIVERS = ("greenlet", "thread")
 
 
-def pytest_addoption(parser) -> None:
+def pytest_addoption(parser):
     parser.addoption(
         "--driver",
         choices=(*DRIVERS, "both"),
@@ -42,7 +42,7 @@ def pytest_addoption(parser) -> None:
     )
 
 
-def pytest_configure(config) -> None:
+def pytest_configure(config):
     config.addinivalue_line(
         "markers", "greenlet(reason): what is tested is different with other drivers"
     )
@@ -53,7 +53,7 @@ def pytest_configure(config) -> None:
         )
 
 
-def pytest_report_header(config) -> str | None:
+def pytest_report_header(config):
     return (
         f"files and tests in the order of --order {config.option.order}"
         if config.option.order
@@ -61,7 +61,7 @@ def pytest_report_header(config) -> str | None:
     )
 
 
-def pytest_collection_modifyitems(config, items) -> None:
+def pytest_collection_modifyitems(config, items):
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
         places = {
@@ -78,7 +78,7 @@ def _driver(request, monkeypatch):
     )
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """Spare the many calls of the collector what is imported anyway."""
     gc.collect()
     gc.freeze()

@@ -4,17 +4,31 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
 
 from simenv_marl.core.plans.options import Options
 
 ROOT = Path(__file__).parents[1]
 
 
-def alone(function: Callable[..., None], *arguments: Any) -> None:
+def python(*words, status=0, **options):
+    """Run Python where it finds the library and the tests, until it ends with that status."""
+    path = os.pathsep.join([*filter(None, sys.path), str(ROOT)])
+    given = {
+        "env": {**os.environ, "PYTHONPATH": path, **options.pop("env", {})},
+        "cwd": ROOT,
+        "text": True,
+        "timeout": 120,
+    }
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, check=False, **given | options
+    )
+    assert done.returncode == status, (done.stdout, done.stderr)
+    return done
+
+
+def alone(function, *arguments):
     """Call a function of a test file in a fresh process, without open resources of other tests.
 
     Environments have the driver of the test that calls. The arguments are strings and numbers.
@@ -28,33 +42,20 @@ gc.freeze()  # so that the function's own collections look at what it makes
 Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or {})["driver"]!r}
 {function.__name__}(*{arguments!r})
 """
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)]),
-    }
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", code)
 
 
-def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
+def run_code(*parts, status=0, options=()):
     """Run code in a process of its own, which ends with that status; return what it has printed.
 
     One that ends well prints no errors; one that hangs is ended.
     """
-    command = [sys.executable, *options, "-c", "\n".join(map(dedent, parts))]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr if status == 0 else "") == (status, ""), (
-        done.stdout + done.stderr
-    )
-    return done.stdout
+    done = python(*options, "-c", "\n".join(map(dedent, parts)), status=status)
+    assert status or done.stderr == "", done.stdout + done.stderr
+    return str(done.stdout)
 
 
-def descriptors() -> dict[str, str]:
+def descriptors():
     """What this process has open: the descriptors, and what they lead to."""
     found = {}
     for number in os.listdir("/proc/self/fd"):
@@ -65,7 +66,7 @@ def descriptors() -> dict[str, str]:
     return found
 
 
-def runs(number: int) -> bool:
+def runs(number):
     """Whether a process runs, and is no zombie."""
     try:
         os.kill(number, 0)
@@ -79,7 +80,7 @@ def runs(number: int) -> bool:
         return False
 
 
-def gone(number: int) -> bool:
+def gone(number):
     """Whether a process ends within a generous time, for busy machines."""
     until = time.monotonic() + 60
     while runs(number) and time.monotonic() < until:

@@ -3,13 +3,10 @@
 import json
 import multiprocessing
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.processes import ROOT, python
 
 
 def names(page, column):
@@ -26,12 +23,7 @@ def names(page, column):
 
 def test_a_quick_run_measures_rows_that_the_page_explains(tmp_path):
     options = f"--quick --json {tmp_path / 'json'} --write {tmp_path / 'table'}".split()
-    subprocess.run(
-        [sys.executable, "-m", "benchmarks.core", *options],
-        cwd=ROOT,
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    python("-m", "benchmarks.core", *options, timeout=None)
     figures = json.loads((tmp_path / "json").read_text())
     assert {
         "decisions",

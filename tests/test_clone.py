@@ -38,8 +38,9 @@ from tests.processes import ROOT, alone, descriptors, gone, runs
 from tests.test_branch import METHODS, ahead, children
 from tests.worlds.counters import FORK, FORKS, POINT, Counter
 from tests.worlds.duels import Duel, points
-from tests.worlds.models import notes
+from tests.worlds.models import begun, notes
 from tests.worlds.trips import POINTS, VIEWS, Free, Lucky, Trip, future, move, outcome, trip
+from tests.worlds.undone import fails
 
 LUCKY = {"simulation": Lucky, "global_rng": True}
 OPTIONS = {
@@ -99,8 +100,7 @@ def test_clones_of_stepped_clones_show_acts_and_times_of_the_original():
     class Short(Duel):
         ceiling = 2.5  # where the one on the left retires
 
-    env = joint_env(Short, points(), discount_rate=0.1)
-    env.reset(seed=5)
+    env = begun(joint_env(Short, points(), discount_rate=0.1), 5)
     twin = clone(env, method="fork")
     action = {"left": 1, "right": 0}
     assert repr(env.step(action)) == repr(twin.step(action))
@@ -131,7 +131,7 @@ def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
 
 def test_clones_have_many_generations_and_end_when_they_are_collected():
     twin, numbers = clone(trip(), method="fork"), []
-    for _ in range(150):
+    for _ in range(30):
         numbers.append(number_of(twin))
         twin = clone(twin, method="fork")
     assert all(map(gone, numbers))
@@ -152,8 +152,7 @@ def test_wrappers_keep_count(method):
     assert clone(twin, method=method).step(1)[3] is twin.step(1)[3] is True
     twin.unwrapped.call(lambda env: env.reset(seed=5))
     assert future(twin.unwrapped) == future(trip("single", Free, taken=0, seed=5))
-    outer = TimeLimit(clone(trip(), method=method), 2)
-    outer.reset(seed=4)
+    outer = begun(TimeLimit(clone(trip(), method=method), 2), 4)
     outer.step(1)
     last = clone(outer, method=method)
     assert last.step(1)[3] is outer.step(1)[3] is True
@@ -184,9 +183,8 @@ def test_errors_surface_as_themselves(view, method):
     with pytest.raises(InvalidActionError):
         twin.unwrapped.call(lambda env: env.unwrapped.step({"walker_0": 99, "guide_0": 99}))
     assert twin.unwrapped.call(outcome) == before
-    with pytest.raises(ZeroDivisionError) as caught:
+    with fails(ZeroDivisionError, "seed 3") as caught:
         [move(twin) for _ in range(10)]
-    assert "seed 3" in notes(caught.value)
     assert caught.value.__cause__ is None
     assert method == "replay" or "in <lambda>\n" in notes(caught.value)
     twin.reset(seed=3)
@@ -196,9 +194,7 @@ def test_errors_surface_as_themselves(view, method):
 @METHODS
 @pytest.mark.parametrize("view", ["aec, padded", "parallel", "single, limited", "joint"])
 @pytest.mark.parametrize("options", [{}, LUCKY])
-def test_the_same_seed_is_the_same_future_of_clones_and_branches_and_nothing_else_moves(
-    view, options, method
-):
+def test_the_same_seed_gives_clones_and_branches_the_same_future(view, options, method):
     env, threaded = trip(view, **options), trip(view, driver="thread", **options)
     random.gauss(0, 1)  # the generators keep a second number
     np.random.standard_normal()
@@ -526,7 +522,7 @@ def test_a_closed_link_of_a_chain_of_clones_is_freed():
     twin = clone(trip(), method="fork")
     depth = twin.call(lambda env: len(inspect.stack()))
     links = []
-    for _ in range(300):
+    for _ in range(40):
         links.append((weakref.ref(twin.unwrapped), weakref.ref(twin.unwrapped.session._fork)))
         deeper = clone(twin, method="fork")
         twin.close()
@@ -687,8 +683,7 @@ def handled(place):
     env = trip()
     twin = clone(env, method="fork")
     deeper = clone(twin, method="fork")
-    envs = vector_env(Counter, POINT, num_envs=2, workers=2, context=FORK)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, POINT, num_envs=2, workers=2, context=FORK), 0)
 
     def wait(env, number):
         time.sleep(0.5)  # the parent sends the signals meanwhile

@@ -139,9 +139,8 @@ GOAL = {"achieved_goal_mapping": list, "desired_goal_mapping": list, "compute_re
 )
 def test_definitions_that_cannot_work_are_refused(changes, match):
     """Also where they are made of others by replacing parts."""
-    with pytest.raises(DefinitionError, match=f"make_step: .*{match}") as caught:
+    with pytest.raises(DefinitionError, match=f"make_step: .*{match}"):
         define(**changes)
-    assert isinstance(caught.value, ValueError)
     spared = {"action_space_mapping": None} if changes.keys() & {"apply", "choices"} else {}
     with pytest.raises(DefinitionError, match=match):
         dataclasses.replace(define(), **spared | changes)
@@ -196,9 +195,7 @@ def test_only_functions_can_be_decided(function):
         ("weakest", lambda pump: pump.weakest(), ("class",), {}),
     ],
 )
-def test_mappings_of_static_and_class_methods_receive_the_arguments_bound_to_the_signature(
-    name, call, args, kwargs
-):
+def test_mappings_of_static_and_class_methods_receive_bound_arguments(name, call, args, kwargs):
     seen = []
 
     def observe(*args, **kwargs):
@@ -218,7 +215,7 @@ def told_by(env, *actions):
     env.reset()
     for action in actions:
         env.step(action)
-    return env.unwrapped.simulation.log
+    return env.simulation.log
 
 
 @pytest.mark.parametrize(
@@ -236,7 +233,7 @@ def test_a_dict_says_what_each_action_decides(space, answers, refused):
     for action in refused:
         with pytest.raises(InvalidActionError, match="is not in its action space"):
             env.step(action)
-    assert env.unwrapped.simulation.log == []  # nothing has moved
+    assert env.simulation.log == []  # nothing has moved
     assert told_by(env, *map(np.int64, answers)) == list(answers.values())
 
 
@@ -313,7 +310,7 @@ def test_what_a_generator_or_coroutine_returns_is_decided_when_it_starts(
     assert env.reset()[0].tolist() == [1, 0]
     env.step(5)
     env.step(RULE)
-    assert env.unwrapped.simulation.log == [told, rule]
+    assert env.simulation.log == [told, rule]
 
 
 def test_one_function_may_have_many_definitions():
@@ -343,7 +340,7 @@ def test_choices_are_asked_once_with_the_arguments_and_make_the_mask():
     assert info["action_mask"].dtype == np.int8
     assert env.step(2)[4]["action_mask"].tolist() == [1, 1, 0, 0]
     assert len(made) == 2
-    assert env.unwrapped.simulation.log == [("board", "left", 2)]
+    assert env.simulation.log == [("board", "left", 2)]
 
 
 @pytest.mark.parametrize("choices", [list, lambda: range(5)])
@@ -379,9 +376,7 @@ WATER, GO, ALSO_GO, GIVEN = (
         ([GO, GIVEN], ["go_1", "go_0"]),
     ],
 )
-def test_default_names_are_the_functions_letters_in_the_order_of_points_and_collide_with_none(
-    points, names
-):
+def test_default_names_are_the_functions_letters_and_never_collide(points, names):
     env = aec_env(calling(GO), points)
     assert env.possible_agents == names
     env.reset()

@@ -268,9 +268,3 @@ def test_public_names_are_in_one_place_each():
 
 
 ROOMS = simenv_marl.ROOMS
-
-
-@pytest.mark.parametrize("name", ["ProcessSimulation", "RolloutPolicy", "NoDecisionError"])
-def test_a_name_of_a_room_says_in_which_room_it_is(name):
-    with pytest.raises(AttributeError, match=rf"from simenv_marl\.\w+ import {name}"):
-        getattr(simenv_marl, name)

@@ -104,7 +104,7 @@ def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
         print(env.posible_agents)
 
 
-def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_the_point():
+def test_an_episode_that_decides_in_a_late_thread_names_it_and_the_point():
     calls, answers = SimpleQueue(), SimpleQueue()
     middleware = Thread(
         target=lambda: [answers.put(call()) for call in iter(calls.get, None)], name="middleware"

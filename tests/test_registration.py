@@ -1,10 +1,6 @@
 """The registries of Gymnasium and PettingZoo."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -22,13 +18,13 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.experiments import Variant
+from tests.processes import python
 from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, define, play
+from tests.worlds.models import begun, calling, decision, define, play
 from tests.worlds.undone import registries_put_back
 
-ROOT = Path(__file__).parent.parent
 SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
 JOINT, TURN = "manyregistered/Joint-v0", "manyregistered/Turn-v0"
 COOP = "manyregistered/coop_v0"
@@ -87,12 +83,10 @@ def test_all_other_points_run_their_rule_or_the_policy_that_is_given(register):
 
 
 def test_options_are_given_when_it_is_made():
-    env = made(SINGLES[0], max_steps=1, render_mode="ansi")
-    env.reset()
+    env = begun(made(SINGLES[0], max_steps=1, render_mode="ansi"))
     assert env.step(RULE)[2:4] == (False, True)
     assert env.render().startswith("at ")
-    env = pettingzoo.make("parallel", COOP, max_steps=1, render_mode="rgb_array")
-    env.reset()
+    env = begun(pettingzoo.make("parallel", COOP, max_steps=1, render_mode="rgb_array"))
     assert all(env.step(dict.fromkeys(env.agents, RULE))[3].values())
     assert env.render().shape == (8, 8, 3)
     with pytest.raises(UnknownOptionError, match="there is no option"):
@@ -119,8 +113,7 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
     ]
     assert second == [identity.replace("v0", "v3") for identity in first]
     assert (length(first), length(second), length(second, max_steps=None)) == (26, 4, 26)
-    env = made(second[0])
-    env.reset()
+    env = begun(made(second[0]))
     assert [env.step(RULE)[3] for _ in range(2)] == [False, True]
 
 
@@ -145,8 +138,7 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
         calling(clerk, lambda: Being(0).act()), points, name="mixed", possible_agents=roster
     )
     assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/Turn-v0", "mixed/coop_v0"]
-    env = made(ids[0])
-    env.reset()
+    env = begun(made(ids[0]))
     env.step(4)
     assert env.simulation.log == [4, "rule"]
     assert pettingzoo.make("aec", ids[-1]).possible_agents == ["clerk_0", "being_0"]
@@ -187,8 +179,7 @@ def test_the_turn_view_takes_all_decisions_and_limits_of_vectors(register):
     observation, info = env.reset(seed=1)
     assert (observation["kind"], info["agent"]) == (0, "helm_0")
     assert [env.step(RULE)[3] for _ in range(3)] == [False, False, True]
-    envs = gymnasium.make_vec(TURN, num_envs=2, max_episode_steps=2)
-    envs.reset(seed=1)
+    envs = begun(gymnasium.make_vec(TURN, num_envs=2, max_episode_steps=2), 1)
     ends = [envs.step(envs.action_space.sample())[3].tolist() for _ in range(2)]
     assert ends == [[False, False], [True, True]]
     envs.close()
@@ -276,20 +267,8 @@ if __name__ == "__main__":
     envs.step(envs.action_space.sample())
     envs.close()
 """
-    path = {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=os.environ | path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
     observation, agents = env.reset(seed=5)[0].tolist(), ["helm_0", "sail_0"]
-    assert done.stdout.splitlines() == [
+    assert python("-W", "error", "-c", code).stdout.splitlines() == [
         str(observation),
         "[False, True]",
         JOINT,

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, simulate, single_env
 from simenv_marl.errors import OptionValueError, SimulationError, UnknownPointError
-from tests.worlds.models import define
+from tests.worlds.models import begun, define
 
 
 class Walk:
@@ -68,24 +68,22 @@ def test_with_the_rule_throughout_it_is_the_plain_model():
     assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(
         3, 20, drift=0.1
     )
-    env = single_env(SteppedSimulation(Walk, 20), STRIDE)
-    env.reset(seed=3)
+    env = begun(single_env(SteppedSimulation(Walk, 20), STRIDE), 3)
     ended = False
     while not ended:
         *_, terminated, truncated, info = env.step(RULE)
         ended = terminated or truncated
-    assert env.unwrapped.simulation.model.place == walked(3, 20)
+    assert env.simulation.model.place == walked(3, 20)
     assert (terminated, truncated, info["time"]) == (False, True, 20.0)
-    first = env.unwrapped.simulation.model
+    first = env.simulation.model
     env.reset(seed=3)
-    assert env.unwrapped.simulation.model is not first
+    assert env.simulation.model is not first
     env.close()
 
 
 @pytest.mark.parametrize("steps", [None, 1000])
 def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
-    env = aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE)
-    env.reset(seed=1)
+    env = begun(aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE), 1)
     while not env.terminations["stride_0"]:
         env.step(2)
     assert not env.truncations["stride_0"]

@@ -1,8 +1,6 @@
 """Templates: the files of the command line run in place, and impossible ones are refused."""
 
 import ast
-import os
-import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +12,8 @@ from simenv_marl import simulate
 from simenv_marl.__main__ import main
 from simenv_marl.testing.fingerprint import differences, fingerprint
 from simenv_marl.testing.templates import KINDS
-from tests.worlds.models import follow_the_rule, play
+from tests.processes import python
+from tests.worlds.models import begun, follow_the_rule, play
 
 SOURCE = Path(__file__).parent.parent / "src"
 PAGE = (SOURCE.parent / "docs/templates.md").read_text()
@@ -22,21 +21,13 @@ PAGE = (SOURCE.parent / "docs/templates.md").read_text()
 
 def run(folder, *arguments):
     """Another Python in a folder, with this library and nothing else of the repository."""
-    return subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(SOURCE)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    return python(*arguments, cwd=folder, env={"PYTHONPATH": str(SOURCE)}, timeout=300)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_written_template_passes_its_own_tests(kind, tmp_path):
     done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stderr == ""
     written = {
         path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
     }
@@ -49,25 +40,20 @@ def test_a_written_template_passes_its_own_tests(kind, tmp_path):
         assert "MyModel" not in text
         assert "MySimulation" not in text
         assert "WaterTankSimulation" in text
-    tested = run(
-        tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error"
-    )
-    assert tested.returncode == 0, tested.stdout
+    run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
 
 
 def test_the_command_check_finds_a_written_template(tmp_path):
     assert main(["new", "plain", "water_tank", "--folder", str(tmp_path)]) == 0
     checked = run(tmp_path, "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
-    assert checked.returncode == 0, checked.stdout + checked.stderr
     assert "nothing to complain of" in checked.stdout
 
 
 # plain needs Stable-Baselines3: tests/clients/test_templates.py
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])
 def test_training_is_worth_something(kind, tmp_path):
-    assert run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".").returncode == 0
+    run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".")
     done = run(tmp_path, "-W", "error::DeprecationWarning:tank", "-m", "tank", "--quick")
-    assert done.returncode == 0, done.stderr
     table = [line.split() for line in done.stdout.splitlines()]
     assert ["contender"] in table
     assert f"{done.stdout.splitlines()[0]}\n" in PAGE
@@ -103,8 +89,7 @@ def test_templates_import_only_packages_that_the_command_names(kind):
 def test_policies_answer_one_observation_as_they_answer_many(kind):
     template = import_module(f"simenv_marl.testing.templates.{kind}")
     policy = template.train(1, 1)
-    env = template.env()
-    env.reset(seed=3)
+    env = begun(template.env(), 3)
     seen = env.last()[0] if kind == "mesa" else env.step(0)[0]
     assert policy(seen) == policy(np.stack([seen, seen]))[1]
     env.close()
@@ -134,14 +119,13 @@ def test_classes_are_not_named_like_others(tmp_path):
     for name in names:
         assert main(["new", "mesa", name, "--folder", str(tmp_path)]) == 0
     code = "; ".join(f"from {name} import {name.title()}Simulation" for name in names)
-    assert run(tmp_path, "-c", code).returncode == 0
+    run(tmp_path, "-c", code)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
     template = import_module(f"simenv_marl.testing.templates.{kind}")
-    plain = template.MySimulation()
-    plain.reset(seed=7)
+    plain = begun(template.MySimulation(), 7)
     plain.run()
     for other in (
         follow_the_rule(template.env(), seed=7),
@@ -152,8 +136,7 @@ def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
 
 def test_agents_of_the_mesa_template_are_born_and_die():
     """Those that starve are terminated, those that see the last day truncated."""
-    env = import_module("simenv_marl.testing.templates.mesa").env()
-    env.reset(seed=7)
+    env = begun(import_module("simenv_marl.testing.templates.mesa").env(), 7)
     first = set(env.agents)
     ends = {
         turn.agent: turn.terminated
@@ -164,7 +147,7 @@ def test_agents_of_the_mesa_template_are_born_and_die():
     assert set(ends.values()) == {True, False}
 
 
-def test_infos_of_the_simpy_template_tell_which_actions_are_legal_and_how_long_they_took():
+def test_infos_of_the_simpy_template_have_masks_and_elapsed_times():
     env = import_module("simenv_marl.testing.templates.simpy").env()
     _, info = env.reset(seed=7)
     assert info["action_mask"].sum() > 1  # a forced choice is not asked for

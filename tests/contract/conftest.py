@@ -3,7 +3,7 @@
 from tests.conftest import DRIVERS
 
 
-def pytest_generate_tests(metafunc) -> None:
+def pytest_generate_tests(metafunc):
     chosen = metafunc.config.getoption("--driver")
     alone = metafunc.definition.get_closest_marker("greenlet") is not None
     drivers = ["greenlet"] if alone else DRIVERS if chosen == "both" else [chosen]

@@ -16,12 +16,12 @@ from simenv_marl import (
     SimulationInterface,
     aec_env,
     joint_env,
-    make_step,
     parallel_env,
     simulate,
     single_env,
 )
-from tests.worlds.models import define
+from tests.worlds.copied import Walk
+from tests.worlds.models import begun, define, follow_the_rule, play
 
 PREY = f"{__name__}.Animal.eat"
 
@@ -97,6 +97,7 @@ KINDS = {
     "deque": deque,
     "dict": as_dict,
     "nested": lambda animals: [[animal] for animal in animals],
+    "named tuple": as_pair,
 }
 
 
@@ -117,30 +118,21 @@ def definition(**changes):
 
 
 def plain_log(source, seed):
-    simulation = source()
-    simulation.reset(seed)
+    simulation = begun(source(), seed)
     simulation.run()
     return simulation.log[:]
 
 
-def rule_log(view, source, seed, **changes):
-    agent = changes.pop("agent", lambda animal: f"animal_{animal.number}")
+def by_number(animal):
+    return f"animal_{animal.number}"
+
+
+def rule_log(view, source, seed, agent=by_number):
     options = {"possible_agents": [f"animal_{number}" for number in range(8)]}
-    if isinstance(agent, str) or view is aec_env:
+    if agent != by_number or view is aec_env:
         options = {}
-    env = view(source, {PREY: definition(agent=agent, **changes)}, **options)
-    env.reset(seed=seed)
-    if view is aec_env:
-        for name in env.agent_iter():
-            ended = env.terminations[name] or env.truncations[name]
-            env.step(None if ended else RULE)
-    elif view is parallel_env:
-        while env.agents:
-            env.step(RULE)
-    else:
-        while not any(env.step(RULE)[2:4]):
-            pass
-    log = env.unwrapped.simulation.log[:]
+    env = view(source, {PREY: definition(agent=agent)}, **options)
+    log = follow_the_rule(env, seed).log[:]
     env.close()
     return log
 
@@ -167,7 +159,7 @@ def test_rule_equals_the_plain_run_of_one_agent_with_a_name(kind):
 def test_policies_that_answer_rule_change_nothing():
     source = meadow_of("list")
     for seed in range(4):
-        point = {PREY: definition(agent=lambda animal: f"animal_{animal.number}")}
+        point = {PREY: definition(agent=by_number)}
         simulation = simulate(source, {PREY: lambda observation: RULE}, points=point, seed=seed)
         assert simulation.log == plain_log(source, seed)
 
@@ -195,36 +187,18 @@ class Bag(SimulationInterface):
         return [item.number for item in items]
 
     def run(self):
-        for _ in range(3):
+        for decide in (lambda items: self.choose(items).number, self.mark) * 3:
             items = [Item(number) for number in range(3)]
             references = [weakref.ref(item) for item in items]
-            self.log.append(self.choose(items).number)
-            del items
-            self.log.append([reference() is None for reference in references])
-            items = [Item(number) for number in range(3)]
-            references = [weakref.ref(item) for item in items]
-            self.log.append(self.mark(items))
+            self.log.append(decide(items))
             del items
             self.log.append([reference() is None for reference in references])
 
 
 BAG = {
-    f"{__name__}.Bag.choose": make_step(
-        observation_space=spaces.Discrete(10),
-        observation_space_mapping=lambda bag, items: len(items),
-        action_space=spaces.Discrete(3),
-        choices=lambda bag, items: items,
-        reward_mapping=lambda bag: 1.0,
-        agent="chooser",
-    ),
-    f"{__name__}.Bag.mark": make_step(
-        observation_space=spaces.Discrete(10),
-        observation_space_mapping=lambda item: item.number,
-        action_space=spaces.Discrete(10),
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda item: 1.0,
-        split=lambda bag, items: items,
-        agent=lambda item: f"item_{item.number}",
+    f"{__name__}.Bag.choose": define(agent="chooser", choices=lambda bag, items: items),
+    f"{__name__}.Bag.mark": define(
+        agent=lambda item: f"item_{item.number}", split=lambda bag, items: items
     ),
 }
 
@@ -232,11 +206,8 @@ BAG = {
 @pytest.mark.parametrize("action", [RULE, 2])
 def test_items_and_choices_are_freed_with_their_call(action):
     env = aec_env(Bag, BAG)
-    env.reset(seed=1)
-    for name in env.agent_iter():
-        ended = env.terminations[name] or env.truncations[name]
-        env.step(None if ended else action)
-    log = env.unwrapped.simulation.log
+    play(env, action, seed=1)
+    log = env.simulation.log
     assert log[1::2] == [[True] * 3] * 6
     assert log[2::4] == [[0, 1, 2] if action is RULE else [2, 2, 2]] * 3
 
@@ -273,8 +244,7 @@ def dish(**changes):
         "action_space": spaces.Discrete(10),
         "agent": "cell",
     }
-    env = single_env(Dish, {FREED: define(**given | changes)})
-    env.reset(seed=1)
+    env = begun(single_env(Dish, {FREED: define(**given | changes)}), 1)
     env.step(RULE)
     return env
 
@@ -283,7 +253,7 @@ def test_a_freed_argument_of_the_reward_mapping_makes_the_last_reward_zero():
     env = dish(observation_space_mapping=lambda cell: [5.0], reward_mapping=lambda cell, size: size)
     with pytest.warns(UserWarning, match=r"has freed self .*the reward is 0\.0.*removed_by"):
         observation, reward, terminated, _, _ = env.step(RULE)
-    assert env.unwrapped.simulation.is_freed
+    assert env.simulation.is_freed
     assert (list(observation), reward, terminated) == ([5.0], 0.0, True)
 
 
@@ -292,7 +262,7 @@ def test_mappings_that_take_other_arguments_are_asked_at_the_end():
         observation_space_mapping=lambda *, food: food[:1], reward_mapping=lambda *, size: size
     )
     observation, reward, terminated, _, _ = env.step(RULE)
-    assert env.unwrapped.simulation.is_freed
+    assert env.simulation.is_freed
     assert (list(observation), reward, terminated) == ([8.0], 4.0, True)
 
 
@@ -307,39 +277,20 @@ def test_a_freed_argument_keeps_the_last_observation():
 
 @pytest.mark.parametrize("make_env", [aec_env, single_env])
 def test_an_environment_that_its_own_mapping_refers_to_is_freed(make_env):
-    class Walk:
-        def reset(self, seed=None):
-            self.place = 0
-
-        def run(self):
-            while True:
-                self.place += self.step()
-
-        def step(self):
-            return 1
-
     def observe(holder, walk):
         return [walk.place, len(holder)]
 
-    def play():
+    def used():
         holder = []
         mapping = partial(observe, holder)
-        definition = make_step(
-            observation_space=spaces.Box(-np.inf, np.inf, (2,)),
-            observation_space_mapping=mapping,
-            action_space=spaces.Discrete(2),
-            action_space_mapping=int,
-            reward_mapping=lambda: 0.0,
-            agent="walker",
-        )
-        env = make_env(Walk, {Walk.step: definition})
+        env = make_env(Walk, {Walk.choose: define(observation_space_mapping=mapping)})
         holder.append(env)
         env.reset(seed=1)
         env.step(1)
         env.close()
         return weakref.ref(env.unwrapped.session)
 
-    session = play()
+    session = used()
     gc.collect()
     assert session() is None
 
@@ -401,8 +352,7 @@ def test_arrays_among_several_arguments_are_read_again():
         observation_space_mapping=lambda model, cell, field: field,
         agent=lambda model, cell: f"cell_{cell.number}",
     )
-    env = parallel_env(Field, {f"{__name__}.Field.choose": given})
-    env.reset(seed=1)
+    env = begun(parallel_env(Field, {f"{__name__}.Field.choose": given}), 1)
     observations, *_ = env.step({"cell_0": 0})
     assert observations["cell_0"].tolist() == [1.0] * 3
 
@@ -425,8 +375,7 @@ def test_a_list_as_the_first_argument_is_held_weakly():
                 self.freed.append(reference() is None)
 
     points = {f"{__name__}.pick": define(observation_space_mapping=lambda: [0.0, 0.0])}
-    simulation = single_env(Picker, points)
-    simulation.reset(seed=1)
+    simulation = begun(single_env(Picker, points), 1)
     simulation.step(RULE)
     simulation.step(RULE)
     assert simulation.unwrapped.simulation.freed == [True, True]

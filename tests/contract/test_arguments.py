@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from simenv_marl import SimulationInterface, aec_env, make_step, single_env
 from simenv_marl.errors import DefinitionError
-from tests.worlds.models import define
+from tests.worlds.models import begun, define
 
 TANK = f"{__name__}.Tank.fill"
 OPEN = f"{__name__}.Tank.mix"
@@ -42,8 +42,7 @@ def seen(mapping, point=TANK, **changes):
         calls.append(value)
         return [0.0, 0.0]
 
-    env = single_env(Plant, {point: define(observation_space_mapping=observe, **changes)})
-    env.reset(seed=1)
+    env = begun(single_env(Plant, {point: define(observation_space_mapping=observe, **changes)}), 1)
     env.close()
     return calls[0]
 
@@ -135,38 +134,42 @@ class Ward(SimulationInterface):
 
 
 def test_own_arguments_come_first_and_are_not_counted():
-    env = aec_env(
-        Ward,
-        {
-            f"{__name__}.Ward.treat": make_step(
-                observation_space=spaces.Discrete(100),
-                observation_space_mapping=lambda patient, ward, patients, hour: hour,
-                action_space=spaces.Discrete(3),
-                apply=lambda action, patient, *, hour: (action, patient, hour),
-                reward_mapping=lambda patient: 0.0,
-                split=lambda ward, patients: patients,
-                gather=lambda patients, decisions: dict(zip(patients, decisions, strict=True)),
-                agent=lambda patient: patient,
-            )
-        },
+    env = begun(
+        aec_env(
+            Ward,
+            {
+                f"{__name__}.Ward.treat": make_step(
+                    observation_space=spaces.Discrete(100),
+                    observation_space_mapping=lambda patient, ward, patients, hour: hour,
+                    action_space=spaces.Discrete(3),
+                    apply=lambda action, patient, *, hour: (action, patient, hour),
+                    reward_mapping=lambda patient: 0.0,
+                    split=lambda ward, patients: patients,
+                    gather=lambda patients, decisions: dict(zip(patients, decisions, strict=True)),
+                    agent=lambda patient: patient,
+                )
+            },
+        ),
+        1,
     )
-    env.reset(seed=1)
     assert env.last()[0] == 5
     env.step(1)
     env.step(2)
-    assert env.unwrapped.simulation.log == [{"ada": (1, "ada", 5), "bob": (2, "bob", 5)}]
+    assert env.simulation.log == [{"ada": (1, "ada", 5), "bob": (2, "bob", 5)}]
 
 
 def test_a_builtin_gets_all_arguments():
-    env = single_env(
-        Plant,
-        {
-            TANK: define(
-                observation_space=spaces.Box(0, 9, (1,), np.float64),
-                observation_space_mapping=lambda tank, level: [level],
-                rule_action_mapping=int,
-            )
-        },
+    env = begun(
+        single_env(
+            Plant,
+            {
+                TANK: define(
+                    observation_space=spaces.Box(0, 9, (1,), np.float64),
+                    observation_space_mapping=lambda tank, level: [level],
+                    rule_action_mapping=int,
+                )
+            },
+        ),
+        1,
     )
-    env.reset(seed=1)
     assert env.step(1)[2]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from simenv_marl import RULE, parallel_env, single_env
+from simenv_marl import RULE, parallel_env
 from tests.worlds.models import calling, decision
 
 
@@ -38,7 +38,7 @@ def test_every_callable_gets_the_bound_arguments_of_calls_that_bind():
         for action, decided in ((1, 7), (RULE, (*args, kwargs["z"]))):
             env.reset()
             env.step({"ant": action})
-            assert env.unwrapped.simulation.log == [decided]
+            assert env.simulation.log == [decided]
         before = {"apply": (1,), "rule action": (decided,)}
         assert seen == {name: ((*before.get(name, ()), *args), kwargs) for name in seen}
         assert len(seen) == 6
@@ -46,11 +46,3 @@ def test_every_callable_gets_the_bound_arguments_of_calls_that_bind():
     with pytest.raises(TypeError, match=r"missing 1 required positional argument: 'x'"):
         parallel_env(calling(lambda: choose(y=1)), choose).reset()
     assert seen == {}
-
-
-def test_the_end_is_observed_with_the_arguments_of_the_last_call():
-    last = decision(lambda x, *, z: 0, observation_space_mapping=lambda x, *, z: [x, z])
-    env = single_env(calling(lambda: last(1, z=4), lambda: last(2, z=5)), last)
-    env.reset()
-    env.step(1)
-    assert env.step(1)[0].tolist() == [2, 5]

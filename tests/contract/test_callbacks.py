@@ -13,7 +13,7 @@ import pytest
 
 from simenv_marl import single_env
 from simenv_marl.remote import CallbackGuard
-from tests.worlds.models import culprits, decision, notes, script, stacks
+from tests.worlds.models import begun, culprits, decision, notes, script, stacks
 
 COMPARE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_int), ctypes.POINTER(ctypes.c_int))
 EACH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
@@ -70,8 +70,7 @@ def comparing():
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 def test_an_end_in_mid_episode_unwinds_past_the_c_code(trigger):
     log, decide, before = [], comparing(), stacks()
-    env = single_env(sorting(decide, log, stop=lambda: log.append("stop")), decide)
-    env.reset()
+    env = begun(single_env(sorting(decide, log, stop=lambda: log.append("stop")), decide))
     env.step(1)
     if trigger != "collect":
         getattr(env, trigger)()
@@ -89,8 +88,7 @@ def test_an_error_in_a_callback_surfaces_from_step_as_itself(error):
             raise error("in C")
 
     log, decide = [], comparing()
-    env = single_env(sorting(fail, log), decide)
-    env.reset(seed=7)
+    env = begun(single_env(sorting(fail, log), decide), 7)
     with pytest.raises(error, match="in C") as caught:
         env.step(1)
     assert culprits(caught.value)[-1] == "fail"
@@ -122,7 +120,6 @@ def test_an_interrupt_while_c_runs_surfaces(during):
             loops().loop_interrupted(EACH(guard.callback(decide)), 9, 1)
 
     guard, decide = CallbackGuard(), decision(lambda number: 0, agent="a_0")
-    env = single_env(script(main), decide)
-    env.reset()
+    env = begun(single_env(script(main), decide))
     with pytest.raises(KeyboardInterrupt):
         env.step(1) if during == "step" else env.close()

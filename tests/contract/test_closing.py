@@ -8,10 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from simenv_marl import (
-    aec_env,
     branch,
-    joint_env,
-    parallel_env,
     simulate,
     simulate_many,
     single_env,
@@ -19,7 +16,9 @@ from simenv_marl import (
 )
 from simenv_marl.data import collect_episodes
 from simenv_marl.experiments import evaluate
-from tests.worlds.models import define, notes
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import begun, define
+from tests.worlds.undone import fails
 
 BOOK = f"{__name__}.Shop.book"
 LOG = []
@@ -84,8 +83,7 @@ def of(what):
 
 
 def test_close_is_called_before_the_next_reset_and_when_the_environment_is_closed():
-    env = single_env(Shop, BOOKS)
-    env.reset(seed=1)
+    env = begun(single_env(Shop, BOOKS), 1)
     env.step(3)
     *_, terminated, _, _ = env.step(4)
     assert terminated
@@ -105,7 +103,7 @@ def test_close_is_called_before_the_next_reset_and_when_the_environment_is_close
 
 
 @pytest.mark.parametrize("shop", [Shop, Broken])
-@pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
+@EVERY_VIEW
 def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error(view, shop):
     envs = [view(shop, BOOKS)]
     envs[0].reset(seed=1)
@@ -120,8 +118,7 @@ def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_vector_environments_close_each_before_it_begins_anew(mode):
-    env = vector_env(Shop, BOOKS, num_envs=2, autoreset_mode=mode)
-    env.reset(seed=1)
+    env = begun(vector_env(Shop, BOOKS, num_envs=2, autoreset_mode=mode), 1)
     for _ in range(2):
         env.step(np.ones(2, np.int64))
     if mode == AutoresetMode.NEXT_STEP:
@@ -157,14 +154,11 @@ def test_runners_close_what_they_have_run_after_it_was_collected():
 def test_its_error_does_not_take_the_place_of_an_earlier_one():
     for run, policies in ((simulate, {BOOK: fail}), (evaluate, {"bad": {BOOK: fail}})):
         seed = {"seed": 1} if run is simulate else {"seeds": [1]}
-        with pytest.raises(LookupError, match="first") as caught:
+        with fails(LookupError, "books cannot be closed", match="first"):
             run(Broken, policies, points=BOOKS, **seed)
-        assert "books cannot be closed" in notes(caught.value)
-    env = single_env(Broken, BOOKS)
-    env.reset(seed=1)
-    with pytest.raises(LookupError, match="first") as caught:
+    env = begun(single_env(Broken, BOOKS), 1)
+    with fails(LookupError, "books cannot be closed", match="first"):
         branch(env, fail, 1, method="replay")
-    assert "books cannot be closed" in notes(caught.value)
     with pytest.raises(ConnectionError):
         env.reset(seed=2)
     assert 2 not in of("reset")

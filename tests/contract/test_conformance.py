@@ -101,7 +101,7 @@ def test_pettingzoos_tests_pass(shape):
     env = made(shape, "aec", "ansi")
     api_test(wrappers.OrderEnforcingWrapper(wrappers.AssertOutOfBoundsWrapper(env)), num_cycles=50)
     env.reset()
-    assert env.render() == f"at {env.unwrapped.simulation.place}"
+    assert env.render() == f"at {env.simulation.place}"
     if shape not in (SHAPES["any order"], SHAPES["one never acts"]):
         # Its tests of rounds do not know of masks in infos, and a masked action is illegal.
         parallel_api_test(made(shape, "parallel"), num_cycles=100)

@@ -14,15 +14,15 @@ import greenlet
 import pytest
 from benchmarks import soak
 
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, joint_env, single_env
 from simenv_marl.core.plans.options import Options
 from simenv_marl.errors import ClosedError, InvalidActionError
 from tests.core.test_threads import in_a_thread
 from tests.processes import alone
-from tests.worlds.models import alive, decision, script, stacks, step, unwinding
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import alive, begun, decision, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
-ALL_VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 decide = decision()
 
@@ -39,7 +39,7 @@ def ended_by(trigger, held):
 # -- ends in mid-episode --------------------------------------------------------------------------
 
 
-@ALL_VIEWS
+@EVERY_VIEW
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
 def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(
@@ -88,8 +88,7 @@ def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
             nested = BaseExceptionGroup("inner", [error])
             raise BaseExceptionGroup("tasks", [nested, *others]) from None
 
-    env = single_env(script(main), decide)
-    env.reset()
+    env = begun(single_env(script(main), decide))
     env.close()
     others.append(ZeroDivisionError())
     env.reset()
@@ -125,7 +124,7 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
 
 
 @pytest.mark.usefixtures("_collected")
-@ALL_VIEWS
+@EVERY_VIEW
 @pytest.mark.parametrize(
     "when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"]
 )
@@ -156,7 +155,7 @@ def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_alo
     elif when == "action refused":
         with pytest.raises(InvalidActionError):
             step(env, "nonsense", "a_0")
-    references = [weakref.ref(thing) for thing in (env, env.unwrapped, env.unwrapped.simulation)]
+    references = [weakref.ref(thing) for thing in (env, env.unwrapped, env.simulation)]
     held = [env]
     del env
     in_a_thread(held.clear) if where == "elsewhere" else held.clear()
@@ -174,7 +173,7 @@ def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_alo
 @pytest.mark.parametrize("where", ["model", "mapping"])
 def test_errors_and_arguments_of_an_episode_are_not_kept_alive(view, where):
     def observe(witness):
-        if where == "mapping" and env.unwrapped.simulation.log:
+        if where == "mapping" and env.simulation.log:
             raise RaisedError
         return [0, 0]
 
@@ -237,10 +236,9 @@ def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger
             with suppress(BaseException):
                 simulation.log.append(decide())
 
-    env = view(script(refuse), decide)
-    env.reset()
+    env = begun(view(script(refuse), decide))
     env.step(1)
-    refusing = env.unwrapped.simulation
+    refusing = env.simulation
     with pytest.warns(ResourceWarning, match="Script refuses to end") as caught:
         getattr(env, trigger)()
     assert caught[0].filename == __file__
@@ -249,9 +247,9 @@ def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger
         with pytest.raises(ClosedError, match="call reset"):
             env.step(1)
         env.reset()
-    assert env.unwrapped.simulation is not refusing
+    assert env.simulation is not refusing
     env.step(2)
-    assert (refusing.log, env.unwrapped.simulation.log) == ([1], [2])
+    assert (refusing.log, env.simulation.log) == ([1], [2])
     stop[0] = True
     env.step(3)
 
@@ -293,8 +291,7 @@ def close_through_printing_c_code(path):
         ctypes.pythonapi.PyRun_SimpleString(b"decide()")  # which calls PyErr_Print
 
     decide = decision()
-    env = single_env(script(lambda simulation: asyncio.run(work())), decide)
-    env.reset()
+    env = begun(single_env(script(lambda simulation: asyncio.run(work())), decide))
     env.close()
     Path(path).touch()
 
@@ -330,16 +327,14 @@ def wrap(decide, how):
 @pytest.mark.parametrize("end", ["close", "reset"])
 def test_an_error_that_names_the_exit_as_its_cause_is_not_the_models(how, end):
     decide = decision()
-    env = single_env(script(lambda simulation: wrap(decide, how)), decide)
-    env.reset()
+    env = begun(single_env(script(lambda simulation: wrap(decide, how)), decide))
     getattr(env, end)()
     env.close()
 
 
 def test_an_error_that_hides_the_exit_is_raised_by_close():
     decide = decision()
-    env = single_env(script(lambda simulation: wrap(decide, "implicitly")), decide)
-    env.reset()
+    env = begun(single_env(script(lambda simulation: wrap(decide, "implicitly")), decide))
     with pytest.raises(EngineError):
         env.close()
     env.reset()
@@ -369,8 +364,7 @@ class Engine:
 @pytest.mark.parametrize("steps", [0, 1, 3])
 def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(steps):
     decide = decision()
-    env = single_env(partial(Engine, decide), decide)
-    env.reset()
+    env = begun(single_env(partial(Engine, decide), decide))
     simulation = env.simulation
     for number in range(steps):
         env.step(number)

@@ -10,7 +10,6 @@ from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, si
 from simenv_marl.errors import (
     AgentError,
     DefinitionError,
-    EpisodeOverError,
     InvalidActionError,
     NoDecisionError,
     OptionValueError,
@@ -18,12 +17,12 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
-from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import Script, begun, calling, decision, decisions, define, plainly, play
 
 PUMP, FAN = decision(agent="pump_0"), decision(agent="fan_0")
 NAMED = define(agent=lambda name: name)(lambda name: "rule")
 BOTH = calling(PUMP, FAN, PUMP)
-EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 
 
 # -- what is made ---------------------------------------------------------------------------------
@@ -51,15 +50,15 @@ def test_generate_env_returns_a_class_of_a_view(points, options, base):
 
 
 @EVERY_VIEW
-def test_environments_have_spaces_of_their_own(make):
+def test_environments_have_spaces_of_their_own(view):
     seeing, acting = spaces.Box(0, 1, (3,), np.float32), spaces.Discrete(4)
     pump = decision(observation_space=seeing, action_space=acting, agent="pump_0")
-    env, other = (make(calling(pump), pump) for _ in range(2))
+    env, other = (view(calling(pump), pump) for _ in range(2))
 
     def spaces_of(env):
-        if make is single_env:
+        if view is single_env:
             return env.observation_space, env.action_space
-        if make is joint_env:
+        if view is joint_env:
             return env.observation_space["pump_0"], env.action_space["pump_0"]
         return env.observation_space("pump_0"), env.action_space("pump_0")
 
@@ -82,14 +81,14 @@ class Rendering(Script):
 
 
 @EVERY_VIEW
-def test_environments_have_metadata_and_a_generator(make):
-    plain = make(calling(PUMP), PUMP)
+def test_environments_have_metadata_and_a_generator(view):
+    plain = view(calling(PUMP), PUMP)
     assert (
         plain.metadata["render_fps"],
         list(plain.metadata["render_modes"]),
         plain.render_mode,
     ) == (4, [], None)
-    env = make(Rendering, PUMP)
+    env = view(Rendering, PUMP)
     assert str(env)
     assert env.unwrapped is env
     assert isinstance(env.simulation, Rendering)
@@ -97,7 +96,7 @@ def test_environments_have_metadata_and_a_generator(make):
     made = generate_env(Rendering, PUMP)  # which Gymnasium asks as a class
     for metadata in (env.metadata, made.metadata):
         assert (metadata["render_fps"], metadata["render_modes"]) == (0.5, ["ansi", "rgb_array"])
-    assert env.metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(make)
+    assert env.metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(view)
     env.reset(seed=3)
     assert env.unwrapped.np_random_seed == 3
     assert env.unwrapped.np_random.random() == np.random.default_rng(3).random()
@@ -143,14 +142,8 @@ def test_environments_have_metadata_and_a_generator(make):
     ids=plainly,
 )
 def test_options_that_cannot_be_are_refused(make, options, error, match):
-    with pytest.raises(error, match=match) as caught:
+    with pytest.raises(error, match=match):
         make(BOTH, PUMP, **options)
-    builtin = {
-        UnknownOptionError: TypeError,
-        OptionValueError: ValueError,
-        UnknownPointError: LookupError,
-    }[error]
-    assert isinstance(caught.value, builtin)
 
 
 def test_views_that_cannot_be_are_refused():
@@ -175,28 +168,15 @@ def test_instances_may_change_the_options_of_their_class():
 # -- max_steps ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("actions", [1, RULE])
-def test_max_steps_runs_on_to_the_next_decision_and_truncates(actions):
-    pump = decision(reward_mapping=lambda: len(env.simulation.log))
-    env = single_env(calling(*[pump] * 5), pump, max_steps=2)
-    for _ in range(2):
-        env.reset()
-        assert env.step(actions)[1:4] == (1.0, False, False)
-        # The second step lets the model run up to its third decision, and is rewarded there.
-        assert env.step(actions)[1:4] == (2.0, False, True)
-        with pytest.raises(EpisodeOverError, match="begin the next one"):
-            env.step(actions)
-    env = single_env(calling(pump, pump), pump, max_steps=2)
-    env.reset()
-    env.step(actions)
-    assert env.step(actions)[1:4] == (2.0, True, False)  # it has ended by itself
-
-
 def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
-    env = aec_env(
-        calling(*[PUMP, FAN] * 5), [PUMP, FAN], max_steps=3, policies={FAN: lambda observation: 1}
+    env = begun(
+        aec_env(
+            calling(*[PUMP, FAN] * 5),
+            [PUMP, FAN],
+            max_steps=3,
+            policies={FAN: lambda observation: 1},
+        )
     )
-    env.reset()
     for _ in range(3):
         with pytest.raises(InvalidActionError, match="is not in its action space"):
             env.step(99)
@@ -253,8 +233,7 @@ def test_a_policys_action_is_checked_and_mapped():
     env = aec_env(calling(fan, PUMP), [fan, PUMP], policies={fan: lambda observation: np.int64(3)})
     play(env, 1)
     assert env.unwrapped.simulation.log == [("mapped", 3), 1]
-    env = aec_env(calling(PUMP, fan), [fan, PUMP], policies={fan: lambda observation: 10})
-    env.reset()
+    env = begun(aec_env(calling(PUMP, fan), [fan, PUMP], policies={fan: lambda observation: 10}))
     with pytest.raises(InvalidActionError, match="is not in its action space"):
         env.step(1)
     env.reset()
@@ -276,13 +255,13 @@ def test_points_of_one_agent_have_equal_spaces_and_one_policy():
     few = {"agent": lambda: "pump_0", "action_space": spaces.Discrete(3)}
     named, other = decision(**few), decision(agent=lambda: "pump_0")
     for first, second in ((PUMP, named), (named, other)):
-        env = aec_env(calling(first, second), [first, second])
-        env.reset()
+        env = begun(aec_env(calling(first, second), [first, second]))
         with pytest.raises(AgentError, match="whose spaces or policies differ"):
             env.step(1)
     again = decision(agent=lambda: "pump_0")
-    env = aec_env(calling(PUMP, again), [PUMP, again], policies={again: lambda observation: 1})
-    env.reset()
+    env = begun(
+        aec_env(calling(PUMP, again), [PUMP, again], policies={again: lambda observation: 1})
+    )
     with pytest.raises(AgentError, match="whose spaces or policies differ"):
         env.step(1)
 
@@ -317,8 +296,7 @@ class Housed(Script):
 )
 def test_a_point_that_is_named_has_the_simulations_own_definition(source):
     for named in (f"{__name__}.Hut.heat", [Hut.heat]):
-        env = single_env(source, named)
-        env.reset()
+        env = begun(single_env(source, named))
         env.step(3)
         assert env.simulation.log == [30, "rule"]
     with pytest.raises(DefinitionError, match="has no definition here"):

@@ -5,7 +5,6 @@ import weakref
 from functools import partial
 from itertools import repeat
 from types import MethodType, SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,8 @@ from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, decisions, follow_the_rule, play, script
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import begun, calling, decision, decisions, follow_the_rule, play, script
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 
@@ -38,13 +38,12 @@ def test_observations_that_do_not_fit_are_errors(view, space, value, at):
     observed = [*[space.sample()] * at, value]
     decide = decision(observation_space=space, observation_space_mapping=lambda: observed.pop(0))
     env = view(calling(decide, decide), decide)
-    with pytest.raises(ObservationError) as caught:
+    with pytest.raises(ObservationError):
         follow_the_rule(env)
-    assert isinstance(caught.value, ValueError)
     assert observed == []
 
 
-def fill(observation: Any) -> None:
+def fill(observation):
     """Overwrite everything that can be overwritten."""
     if isinstance(observation, dict):
         for value in observation.values():
@@ -131,13 +130,12 @@ def test_an_array_with_one_reference_to_it_is_copied(place):
     assert observe().tolist() == [1.0, 2.0]
 
 
-def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity_is_still_there():
+def test_observations_are_computed_at_each_decision_and_at_the_end():
     program = (
         "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health"
         " 6, 1 health 5, 2 forgotten"
     )
-    env = aec_env(life(program), beings())
-    env.reset()
+    env = begun(aec_env(life(program), beings()))
     seen = []
     while not any(env.terminations.values()):
         seen.append((env.agent_selection, env.last()[0].tolist(), env.observe("being_0").tolist()))
@@ -155,8 +153,10 @@ def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity
     assert ended == {"being_0": ([0, 6], 6.0), "being_1": ([1, 5], 5.0), "being_2": ([2, 0], 0.0)}
 
 
-def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_its_space():
-    space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9))
+def test_before_its_first_decision_an_agent_observes_a_blank():
+    dials = spaces.MultiDiscrete([2, 2], start=[-5, -1])
+    parts = spaces.Tuple([dials, spaces.MultiBinary(2)])
+    space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9), c=parts)
     other = decision(agent="other_0")
     late = decision(agent="late_0", observation_space=space, observation_space_mapping=space.sample)
     env = aec_env(calling(other, late), [other, late])
@@ -164,7 +164,8 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
         env.reset()
         for _ in range(2):
             observation = env.observe("late_0")
-            assert same(observation, {"a": np.float32([1]), "b": np.int64(-7)})
+            parts = np.array([-4, 0]), np.zeros(2, np.int8)
+            assert same(observation, {"a": np.float32([1]), "b": np.int64(-7), "c": parts})
             fill(observation)
         env.step(1)
 
@@ -172,7 +173,7 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
 # -- 5.4: rewards ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@EVERY_VIEW
 @pytest.mark.parametrize("before", [0, 1, 2], ids=["first", "second", "at the end"])
 @pytest.mark.parametrize(
     ("paid", "told"),
@@ -204,9 +205,8 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
         reward = reward_of_step()
         assert (reward, type(reward)) == (told, float)
     else:
-        with pytest.raises(RewardError, match=told) as caught:
+        with pytest.raises(RewardError, match=told):
             reward_of_step()
-        assert isinstance(caught.value, ValueError)
 
 
 # -- 5.6: the rule --------------------------------------------------------------------------------
@@ -226,12 +226,11 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
 @VIEWS
 def test_rule_and_whatever_is_sampled_are_actions(view, space):
     decide = decision(action_space=space, agent="a_0", action_space_mapping=lambda action: "sample")
-    env = view(calling(*[decide] * 6), decide)
-    env.reset(seed=1)
+    env = begun(view(calling(*[decide] * 6), decide), 1)
     env.step(RULE)
     for _ in range(5):
         env.step((env.action_space("a_0") if view is aec_env else env.action_space).sample())
-    assert env.unwrapped.simulation.log == ["rule"] + ["sample"] * 5
+    assert env.simulation.log == ["rule"] + ["sample"] * 5
 
 
 # -- 5.6: entities --------------------------------------------------------------------------------
@@ -260,7 +259,7 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
         script(main), beings(removed_by=(), **changes), policies=policy and {"being_2": policy}
     )
     turns = play(env, actions)
-    assert env.unwrapped.simulation.log == [
+    assert env.simulation.log == [
         [True, False, False],
         [True, True, False],
         [True, True, True],
@@ -270,30 +269,6 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
     assert sorted(turn.agent for turn in turns if turn.terminated) == [
         f"being_{n}" for n in sorted(set(asked))
     ]
-
-
-@pytest.mark.parametrize(
-    ("view", "action", "gone"),
-    [
-        (single_env, RULE, [True, False]),
-        (single_env, 0, [True, False]),
-        (aec_env, 1, [False, True]),
-    ],
-)
-def test_a_choice_that_the_model_lets_go_is_not_kept_alive(view, action, gone):
-    flock = []
-    chase = decision(lambda: flock[0], choices=lambda: list(flock), action_space=spaces.Discrete(2))
-
-    def main(simulation):
-        flock[:] = [Being(0), Being(1)]
-        watched = [weakref.ref(being) for being in flock]
-        flock.remove(chase())
-        simulation.log += [watch() is None for watch in watched]
-
-    env = view(script(main), chase)
-    env.reset()
-    env.step(action)
-    assert env.unwrapped.simulation.log == gone
 
 
 # -- 5.7: actions ---------------------------------------------------------------------------------
@@ -327,15 +302,13 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
         agent="a_0",
         action_space_mapping=lambda action: moved.append(action) or "done",
     )
-    env = view(calling(decide, decide), decide)
-    env.reset(seed=3)
+    env = begun(view(calling(decide, decide), decide), 3)
     for step, right in enumerate(legal):
         for action in illegal:
             before = env.last() if view is aec_env else None
-            with pytest.raises(InvalidActionError, match="a_0") as caught:
+            with pytest.raises(InvalidActionError, match="a_0"):
                 env.step(action)
-            assert isinstance(caught.value, ValueError)
-            assert len(moved) == len(env.unwrapped.simulation.log) == step
+            assert len(moved) == len(env.simulation.log) == step
             if view is aec_env:
                 assert env.agent_selection == "a_0"
                 after = env.last()
@@ -345,4 +318,4 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
         assert np.array_equal(
             np.asarray(moved[-1]), np.asarray(right).astype(space.dtype or object)
         )
-    assert env.unwrapped.simulation.log == ["done", "done"]
+    assert env.simulation.log == ["done", "done"]

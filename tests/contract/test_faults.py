@@ -15,7 +15,6 @@ import pytest
 import simenv_marl
 from simenv_marl import (
     aec_env,
-    joint_env,
     parallel_env,
     simulate,
     simulate_many,
@@ -29,10 +28,9 @@ from tests.core.test_threads import in_a_thread
 from tests.processes import alone
 from tests.worlds import farms
 from tests.worlds.farms import PLAN, POINTS, Beast, Farm, Small, cut_short, farm_env, run, take
+from tests.worlds.marks import EVERY_VIEW, VIEWS
 from tests.worlds.models import culprits, decision, nobody_is_asked, notes, stacks, step
 
-VIEWS = (aec_env, parallel_env, joint_env, single_env)
-EACH_VIEW = pytest.mark.parametrize("view", VIEWS)
 ORIGINALS = [dict(vars(Farm)), dict(vars(Beast))]
 
 
@@ -262,7 +260,7 @@ def interrupt_at(number, function, *args):
     return where, raised
 
 
-@EACH_VIEW
+@EVERY_VIEW
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
     # In a process of its own: where greenlets were interrupted amid a switch, the collector may
     # crash later.
@@ -297,7 +295,7 @@ def interrupt_anywhere(name):
             whole_run(env)
             env.reset(seed=1)
             act(env)
-            assert env.unwrapped.simulation.log == ["rule", 3], where
+            assert env.simulation.log == ["rule", 3], where
             env.close()
         assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
     assert number > 100
@@ -349,12 +347,12 @@ def deep_down(function, room):
 
 
 @pytest.mark.usefixtures("_collected")
-@EACH_VIEW
+@EVERY_VIEW
 def test_an_environment_survives_the_end_of_its_users_stack(view):
     env, ends = view(Model, decide), set()
     for room in range(1, 60):
         env.reset()
-        log = env.unwrapped.simulation.log
+        log = env.simulation.log
         for use in (partial(act, env), env.reset, env.close):
             try:
                 deep_down(use, room)
@@ -367,6 +365,6 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
         assert log[-1] == "unwound"
         act(env)
         act(env)
-        assert env.unwrapped.simulation.log == ["rule", 3, 3, "unwound"]
+        assert env.simulation.log == ["rule", 3, 3, "unwound"]
         assert nobody_is_asked()
     assert ends >= {"went well", "came to the end"}

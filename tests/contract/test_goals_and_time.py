@@ -30,11 +30,9 @@ from simenv_marl.errors import (
 )
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, define, play, step
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import begun, calling, decision, define, play, step
 from tests.worlds.undone import registries_put_back
-
-EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-
 
 # -- goals ----------------------------------------------------------------------------------------
 
@@ -127,8 +125,7 @@ def test_mappings_of_goals_take_as_many_arguments_as_they_want():
 
 
 def test_rewards_are_computed_anew_for_other_goals():
-    env = single_env(Walk, goals())
-    env.reset(seed=3)
+    env = begun(single_env(Walk, goals()), 3)
     observations, rewards, _, truncations, infos = zip(
         *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
     )
@@ -207,8 +204,7 @@ def test_masks_on_request_are_flat_and_pass_through_wrappers():
     assert masks().tolist() == [True] * 5
     for space in (spaces.Discrete(5, start=2), parts):
         ant = decision(agent="ant_0", action_space=space)
-        env = single_env(calling(ant), ant)
-        env.reset()
+        env = begun(single_env(calling(ant), ant))
         assert env.action_masks().tolist() == [True] * 5
 
 
@@ -242,15 +238,15 @@ MASKED = {"action_mask_mapping": lambda: ONE_MASK}
     ],
     ids=["a mask", "choices", "a mask of several parts"],
 )
-def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, legal, log):
+def test_masked_actions_are_illegal_in_every_view(view, changes, mask, illegal, legal, log):
     ant = decision(agent="ant_0", **changes)
-    env = make(calling(ant, ant), ant)
+    env = view(calling(ant, ant), ant)
     result = env.reset(seed=1)
-    if make is joint_env:
+    if view is joint_env:
         given = result[1]["action_mask"]["ant_0"]
     else:
-        infos = env.infos if make is aec_env else result[1]
-        given = (infos if make is single_env else infos["ant_0"])["action_mask"]
+        infos = env.infos if view is aec_env else result[1]
+        given = (infos if view is single_env else infos["ant_0"])["action_mask"]
     parts = given if len(mask) > 1 else (given,)
     assert [part.tolist() for part in parts] == mask
     assert {part.dtype for part in parts} == {np.dtype(np.int8)}
@@ -305,25 +301,14 @@ def times(turns, agent):
     return [(turn.info["time"], turn.info["elapsed"]) for turn in turns if turn.agent == agent]
 
 
-def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = aec_env(
-        lambda: Clock((0, ant), (2, bee), (2.5, ant), (7, ant), (7, bee), end=11), [ant, bee]
-    )
-    for _ in range(2):
-        turns = play(env, 1)
-        assert times(turns, "ant_0") == [(0, 0), (2.5, 2.5), (7, 4.5), (11, 4)]
-        assert times(turns, "bee_0") == [(2, 0), (7, 5), (11, 4)]
-    assert {type(value) for turn in turns for value in turn.info.values()} == {float}
-
-
 def test_the_time_of_the_announced_and_of_the_dead():
     program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
-    env = aec_env(
-        life(program, announced=[0, 1], timed=True),
-        beings(action_mask_mapping=lambda being: ONE_MASK),
+    env = begun(
+        aec_env(
+            life(program, announced=[0, 1], timed=True),
+            beings(action_mask_mapping=lambda being: ONE_MASK),
+        )
     )
-    env.reset()
     told = env.infos["being_1"]
     assert (told["time"], told["elapsed"], told["action_mask"].tolist()) == (
         0.0,
@@ -389,10 +374,10 @@ def told(env):
 
 @EVERY_VIEW
 @pytest.mark.parametrize("rate", [0.25, 0, None])
-def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(make, rate):
+def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(view, rate):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
-    env = make(clock, ant, discount_rate=rate)
+    env = view(clock, ant, discount_rate=rate)
     for _ in range(2):
         infos = told(env)
         assert [(info["time"], info["elapsed"]) for info in infos] == [
@@ -401,22 +386,9 @@ def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discou
             (7.0, 4.0),
             (8.0, 1.0),
         ]
+        assert {type(info[name]) for info in infos for name in ("time", "elapsed")} == {float}
         expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
         assert [info.get("discount") for info in infos] == expected
-
-
-def test_forced_moves_are_discounted_with_the_decision_after_them():
-    masks = iter([[1, 1], [1, 0], [1, 1], [1, 1]])
-    ant = decision(
-        agent="ant_0",
-        action_space=spaces.Discrete(2),
-        action_mask_mapping=lambda: np.array(next(masks), np.int8),
-    )
-    env = single_env(
-        lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5
-    )
-    env.reset()
-    assert env.step(1)[-1]["discount"] == exp(-3.0)
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
@@ -426,14 +398,6 @@ def test_rates_that_do_not_discount_are_refused(rate):
         match="discount_rate must be a finite number that is not negative, or None",
     ):
         aec_env(lambda: Clock(end=1), decision(agent="ant_0"), discount_rate=rate)
-
-
-def test_a_rate_needs_a_simulation_that_has_a_time():
-    ant = decision(agent="ant_0")
-    env = aec_env(calling(ant), ant, discount_rate=0.1)
-    for _ in range(2):
-        with pytest.raises(OptionValueError, match=r"has no method time\(\); add one"):
-            env.reset()
 
 
 # -- infos ----------------------------------------------------------------------------------------
@@ -469,8 +433,7 @@ def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
 
 def test_everything_is_legal_for_those_who_have_not_decided_yet():
     ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
-    env = aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk])
-    env.reset()
+    env = begun(aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk]))
     env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
     assert env.infos["elk_0"]["action_mask"].tolist() == [1] * 10
     env.reset()
@@ -544,9 +507,9 @@ class Ragged(Counted):
 
 
 @EVERY_VIEW
-def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
+def test_the_state_is_a_copy_of_the_simulations_in_its_space(view):
     ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
-    env = make(lambda: Counted(ant), ant)
+    env = view(lambda: Counted(ant), ant)
     assert env.state_space is None
     env.reset()
     state = env.state()
@@ -556,7 +519,7 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     assert state.tolist() == [1, 4]
     state[:] = 9
     assert env.simulation.numbers.tolist() == [1, 4]
-    env = make(lambda: Counted(ant), ant, state_space=space)
+    env = view(lambda: Counted(ant), ant, state_space=space)
     assert env.state_space == space
     env.reset()
     assert env.state().dtype == np.float32
@@ -575,8 +538,7 @@ def test_states_that_cannot_be_are_refused():
         (lambda: Ragged(ant), {}, ObservationError, "has returned an illegal value: setting"),
         (calling(ant), {}, NotImplementedError, None),
     ):
-        env = parallel_env(make, ant, **options)
-        env.reset()
+        env = begun(parallel_env(make, ant, **options))
         with pytest.raises(error, match=match):
             env.state()
     with pytest.raises(OptionValueError, match="must be a gymnasium space"):
@@ -612,8 +574,7 @@ def test_the_state_may_be_what_all_observe(make):
         env.step(RULE)
     assert env.state().tolist() == [1, 2, 0, 0, 1]
     for view in (single_env, joint_env):
-        env = view(calling(ant), ant, state_space="observations")
-        env.reset()
+        env = begun(view(calling(ant), ant, state_space="observations"))
         assert env.state().tolist() == [1, 2]
         assert env.state() in env.state_space
 
@@ -622,10 +583,10 @@ def test_the_state_may_be_what_all_observe(make):
 
 
 @EVERY_VIEW
-def test_the_simulation_renders_in_its_modes(make, capsys):
+def test_the_simulation_renders_in_its_modes(view, capsys):
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
-        make(lambda: Counted(ant), ant, render_mode=mode)
+        view(lambda: Counted(ant), ant, render_mode=mode)
         for mode in ("ansi", "rgb_array", "human", None)
     )
     assert ansi.render_mode == "ansi"

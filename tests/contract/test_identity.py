@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
+from tests.worlds.marks import VIEWS
 from tests.worlds.models import follow_the_rule
 from tests.worlds.random_worlds import (
     HERE,
@@ -21,8 +22,6 @@ from tests.worlds.random_worlds import (
     plain,
     seeds,
 )
-
-VIEWS = (aec_env, parallel_env, joint_env, single_env)
 
 
 def seeing(machine_or_yard, *args, **kwargs):
@@ -139,7 +138,7 @@ class Player:
         for action in self.actions:
             other.step(action)
         assert other.told == self.told
-        ours, theirs = self.env.unwrapped.simulation, other.env.unwrapped.simulation
+        ours, theirs = self.env.simulation, other.env.simulation
         assert (ours.trace, ours.random.getstate()) == (theirs.trace, theirs.random.getstate())
         other.env.close()
 

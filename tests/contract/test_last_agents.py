@@ -8,11 +8,10 @@ from simenv_marl import (
     SimulationInterface,
     aec_env,
     joint_env,
-    make_step,
     parallel_env,
     single_env,
 )
-from tests.worlds.models import define
+from tests.worlds.models import begun, calling, decision, define, play
 
 GRAZE = f"{__name__}.Sheep.graze"
 SHEEP = ["sheep_0", "sheep_1"]
@@ -68,15 +67,11 @@ POINTS = {
 }
 
 
-def play(env):
+def steps_of(env):
     """Play an episode of any view; return the number of its steps."""
-    env.reset(seed=1)
     if hasattr(env, "agent_iter"):
-        agents = []
-        for agent in env.agent_iter():
-            agents.append(agent)
-            env.step(None if env.terminations[agent] else 1)
-        return len(agents)
+        return len(play(env, 1))
+    env.reset()
     steps = 0
     over = False
     while not over:
@@ -105,47 +100,26 @@ def play(env):
 def test_an_episode_ends_with_the_last_agent_of_its_roster(view, options, steps, kind):
     env = view(kind, POINTS[kind], max_steps=500, **options)
     for _ in range(2):
-        assert play(env) == steps
-        assert env.unwrapped.simulation.years == 3
+        assert steps_of(env) == steps
+        assert env.simulation.years == 3
     env.close()
 
 
 def test_a_dead_agent_is_gone_from_the_model_when_the_episode_ends():
     env = single_env(Meadow, POINTS[Meadow], agent="sheep_1", max_steps=500)
-    play(env)
+    steps_of(env)
     assert "sheep_1" not in [sheep.name for sheep in env.simulation.living]
 
 
 def test_a_simulation_without_a_limit_of_steps_runs_to_its_end():
     env = parallel_env(Meadow, POINTS[Meadow], possible_agents=SHEEP)
-    play(env)
+    steps_of(env)
     assert env.simulation.years == 1000
 
 
 def test_an_apply_that_calls_its_function_reports_no_action_of_the_rule():
-    class Tank:
-        @make_step(
-            observation_space=spaces.Discrete(9),
-            observation_space_mapping=lambda tank: 0,
-            action_space=spaces.Discrete(5),
-            apply=lambda action, tank: tank.fill() + action,
-            reward_mapping=lambda tank: 0.0,
-            rule_action_mapping=int,
-        )
-        def fill(self):
-            return 3
-
-    class Plant:
-        def reset(self):
-            self.tank = Tank()
-            self.filled = []
-
-        def run(self):
-            for _ in range(4):
-                self.filled.append(self.tank.fill())
-
-    env = single_env(Plant, Tank.fill)
-    env.reset(seed=1)
+    fill = decision(lambda: 3, apply=lambda action: fill() + action, rule_action_mapping=int)
+    env = begun(single_env(calling(*[fill] * 4), fill))
     infos = [env.step(action)[4] for action in (1, RULE, 2)]
-    assert env.simulation.filled == [4, 3, 5]
+    assert env.simulation.log == [4, 3, 5]
     assert infos == [{}, {"rule_action": 3}, {}]

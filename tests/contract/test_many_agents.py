@@ -1,7 +1,6 @@
 """Agents that are entities: their names, rosters, births and deaths."""
 
 import re
-from collections import Counter
 from weakref import ref
 
 import pytest
@@ -11,7 +10,6 @@ from simenv_marl import (
     RULE,
     TRUNCATED,
     SimEnvError,
-    SimulationInterface,
     aec_env,
     parallel_env,
     simulate,
@@ -28,7 +26,7 @@ from simenv_marl.errors import (
     UnknownPointError,
 )
 from tests.worlds import lives
-from tests.worlds.lives import Life, life, story
+from tests.worlds.lives import life, story
 from tests.worlds.many_worlds import (
     HERE,
     Announcing,
@@ -36,15 +34,25 @@ from tests.worlds.many_worlds import (
     Being,
     Colony,
     Other,
-    answer,
     being_of,
     beings,
     colony,
     designs,
     others,
+    played,
     seeds,
 )
-from tests.worlds.models import decision, decisions, define, follow_the_rule, notes, play, script
+from tests.worlds.models import (
+    begun,
+    decision,
+    decisions,
+    define,
+    follow_the_rule,
+    notes,
+    play,
+    script,
+)
+from tests.worlds.undone import fails
 
 NAMES = ["being_0", "being_1", "being_2"]
 IN_ORDER = "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 3 health 1, 3 acts"
@@ -128,7 +136,7 @@ def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
 # -- rosters --------------------------------------------------------------------------------------
 
 
-def test_declared_agents_are_there_from_the_start_and_those_who_have_decided_leave_first():
+def test_declared_agents_are_there_at_once_and_deciders_leave_first():
     roster = [*NAMES, "being_3"]
     env = aec_env(life("2 acts, 0 acts"), beings(), possible_agents=iter(roster))
     assert env.possible_agents == roster
@@ -189,8 +197,7 @@ def test_rosters_that_cannot_be_are_refused(options, error, match):
 
 
 def test_an_undeclared_agent_is_an_error_that_ends_the_episode():
-    env = aec_env(life("0 acts, 5 acts, 0 acts"), beings(), possible_agents=NAMES)
-    env.reset()
+    env = begun(aec_env(life("0 acts, 5 acts, 0 acts"), beings(), possible_agents=NAMES))
     with pytest.raises(AgentError, match=r"being_5.*possible_agents"):
         env.step(1)
     assert env.agents == []
@@ -215,8 +222,7 @@ def test_an_undeclared_agent_may_follow_its_rule():
 def test_announced_agents_join_and_are_observed_before_their_first_decision():
     paid = []
     definition = beings(reward_mapping=lambda being: paid.append(being.number) or 0.0)
-    env = aec_env(life(IN_ORDER, announced=[0, 1, 2, 2, 0]), definition)
-    env.reset()
+    env = begun(aec_env(life(IN_ORDER, announced=[0, 1, 2, 2, 0]), definition))
     assert set(env.simulation.asked) == {f"{HERE}.Being.act"}
     assert env.agents == NAMES
     assert env.last()[0].tolist() == [0, 1]
@@ -252,14 +258,13 @@ def test_announced_agents_join_and_are_observed_before_their_first_decision():
 def test_those_who_are_announced_join_if_their_decisions_are_the_users(
     announced, changes, options, agents, log
 ):
-    env = aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options)
-    env.reset()
+    env = begun(aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options))
     assert env.agents == [f"being_{number}" for number in agents]
     play(env, 1, reset=False)
     assert env.simulation.log == log
 
 
-def test_announced_agents_that_never_decide_end_with_the_episode_or_when_they_are_removed():
+def test_announced_agents_that_never_decide_end_with_the_episode():
     program = life("0 acts, 2 health 8, 2 leaves, 1 acts, 3 health 4", announced=[1, 2, 3])
     turns = play(aec_env(program, beings()), 1)
     assert story(turns) == "0 2+ 1 0+ 1+ 3+"
@@ -270,8 +275,7 @@ def test_announced_agents_that_never_decide_end_with_the_episode_or_when_they_ar
 
 def test_of_several_announced_calls_of_an_agent_the_first_one_is_observed():
     named = beings(agent=lambda being: "late" if being.number else "early")
-    env = aec_env(life("0 acts, 4 acts", announced=[4, 3, 0]), named)
-    env.reset()
+    env = begun(aec_env(life("0 acts, 4 acts", announced=[4, 3, 0]), named))
     assert env.observe("late").tolist() == [4, 0]
 
 
@@ -279,8 +283,7 @@ def test_of_several_announced_calls_of_an_agent_the_first_one_is_observed():
 
 
 def test_a_removed_agent_is_rewarded_and_observed_while_it_is_whole():
-    env = aec_env(life("0 acts, 1 acts, 0 health 5, 0 leaves, 1 acts"), beings())
-    env.reset()
+    env = begun(aec_env(life("0 acts, 1 acts, 0 health 5, 0 leaves, 1 acts"), beings()))
     env.step(1)
     env.step(1)
     assert env.simulation.beings[0].whole is False
@@ -315,8 +318,7 @@ def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action, 
         return "applied"
 
     points = {Mortal.act: beings(apply=apply)[Being.act]}
-    env = aec_env(life("0 acts, 1 acts", kind=Mortal), points)
-    env.reset()
+    env = begun(aec_env(life("0 acts, 1 acts", kind=Mortal), points))
     env.step(action)
     assert env.simulation.log == [answered]
     assert env.agent_selection == "being_0"
@@ -324,8 +326,7 @@ def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action, 
     assert (observation.tolist(), reward, terminated) == ([0, 30], 30.0, True)
     env.step(None)
     assert env.agent_selection == "being_1"
-    env = parallel_env(life("0 acts, 1 acts", kind=Mortal), points)
-    env.reset()
+    env = begun(parallel_env(life("0 acts, 1 acts", kind=Mortal), points))
     _, rewards, terminations, _, infos = env.step({"being_0": action})
     assert rewards == {"being_0": 30.0, "being_1": 0.0}
     assert terminations == {"being_0": True, "being_1": False}
@@ -393,11 +394,9 @@ def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(
     view, agent, roster, again
 ):
     program = life(f"0 acts, 0 leaves, {again} number 0, {again} whole 1, {again} acts, 0 fails")
-    env = view(program, beings(agent=agent), possible_agents=roster)
-    env.reset(seed=11)
-    with pytest.raises(AgentError, match=r"being_0.*after its end") as caught:
+    env = begun(view(program, beings(agent=agent), possible_agents=roster), 11)
+    with fails(AgentError, "seed 11", match=r"being_0.*after its end"):
         env.step({"being_0": 1} if view is parallel_env else 1)
-    assert "seed 11" in notes(caught.value)
     assert env.agents == []
     with pytest.raises(EpisodeOverError, match="begin the next one"):
         env.step({} if view is parallel_env else 1)
@@ -433,7 +432,7 @@ class Young(Being):
         return "rule"
 
 
-def test_an_inherited_removal_ends_the_agents_of_all_points_of_a_subclass_and_of_that_alone():
+def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
     points = {
         Young.go: define(agent=lambda it: f"goer_{it.number}", removed_by=LEAVE),
         Young.come: define(agent=lambda it: f"comer_{it.number}", removed_by=LEAVE),
@@ -469,8 +468,7 @@ def test_removals_that_cannot_be_are_refused(removed_by, error, match):
 @pytest.mark.usefixtures("_collected")  # an environment of another test would still patch the class
 def test_removing_functions_work_as_before_outside_of_environments():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
-    env = aec_env(life("0 acts, 1 acts"), beings())
-    env.reset()
+    env = begun(aec_env(life("0 acts, 1 acts"), beings()))
     outside = Being(0)
     assert outside.act() == "rule"
     outside.leave()
@@ -479,10 +477,9 @@ def test_removing_functions_work_as_before_outside_of_environments():
     assert (vars(Being)["leave"], vars(Being)["act"]) == (leave, act)
 
 
-def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation_runs_on():
+def test_the_single_view_ends_with_its_agent_and_the_simulation_runs_on():
     program = life("0 acts, 0 health 4, 0 leaves, 1 health 7", ends=TRUNCATED)
-    env = single_env(program, beings(agent="hero_0"))
-    env.reset()
+    env = begun(single_env(program, beings(agent="hero_0")))
     observation, *told = env.step(1)[:4]
     assert (observation.tolist(), told) == ([0, 4], [4.0, True, False])
     assert env.simulation.beings[1].health == 7
@@ -497,8 +494,9 @@ def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation
     ],
 )
 def test_an_error_at_an_end_says_whose_it_was(program, whose):
-    env = aec_env(life(program), beings(reward_mapping=lambda being: 1 / (being.health + 1)))
-    env.reset(seed=19)
+    env = begun(
+        aec_env(life(program), beings(reward_mapping=lambda being: 1 / (being.health + 1))), 19
+    )
     env.step(1)
     with pytest.raises(ZeroDivisionError) as caught:
         env.step(1)
@@ -537,21 +535,6 @@ def test_choices_keep_no_entity_alive(make, announced):
 # -- ends by name ---------------------------------------------------------------------------------
 
 
-class Ending(Life, SimulationInterface):
-    """A life in which "ends" ends an agent by its name, without any call that could be named."""
-
-    def happens(self, number, what, *value):
-        if what == "ends":
-            self.end_agent(None)  # nobody
-            self.end_agent(being_of(self.beings[number]))
-        else:
-            super().happens(number, what, *value)
-
-
-def ending(program):
-    return lambda: Ending(program, None, None, Being)
-
-
 BY_NAME = beings(removed_by=())
 
 
@@ -560,24 +543,23 @@ def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_l
     program = (
         "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
     )
-    turns = play(aec_env(ending(program), BY_NAME), 1)
+    turns = play(aec_env(life(program), BY_NAME), 1)
     assert story(turns) == "0 1 2 1+ 0 2 0+ 2+"
     assert (turns[3].observation.tolist(), turns[3].reward) == ([1, 2], 2.0)
-    env = parallel_env(
-        ending("0 acts, 1 acts, 1 health 3, 1 ends, 0 acts"), BY_NAME, possible_agents=NAMES[:2]
+    env = begun(
+        parallel_env(
+            life("0 acts, 1 acts, 1 health 3, 1 ends, 0 acts"), BY_NAME, possible_agents=NAMES[:2]
+        )
     )
-    env.reset()
     _, rewards, terminations, *_ = env.step({"being_0": 1, "being_1": 1})
     assert (rewards["being_1"], terminations) == (3.0, {"being_0": False, "being_1": True})
     assert env.agents == ["being_0"]
 
 
 def test_outside_an_environment_end_agent_does_nothing():
-    program = ending("0 acts, 0 ends, 0 acts")
-    env = aec_env(program, BY_NAME)
-    env.reset()
-    plain = program()
-    plain.reset()
+    program = life("0 acts, 0 ends, 0 acts")
+    env = begun(aec_env(program, BY_NAME))
+    plain = begun(program())
     plain.run()  # while an environment is in use, too
     assert plain.log == simulate(program, points=BY_NAME).log == ["rule", "rule"]
     assert env.agents == ["being_0"]
@@ -586,36 +568,6 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 
 # -- everything at once ---------------------------------------------------------------------------
-
-
-def played(env, seed):
-    """Play a colony; check PettingZoo's books at every step.
-
-    Returns who decided, the totals and the ends.
-    """
-    env.reset(seed=seed)
-    decided, totals, ends = [], Counter(), {}
-    booked = Counter(env.rewards)
-    for agent in env.agent_iter():
-        assert agent not in ends
-        assert agent in env.agents
-        assert len(set(env.agents)) == len(env.agents)
-        for book in (env.rewards, env.terminations, env.truncations, env.infos):
-            assert set(book) == set(env.agents)
-        observation, reward, terminated, truncated, _ = env.last()
-        assert observation in env.observation_space(agent)
-        totals[agent] += reward
-        assert type(reward) is float
-        assert type(terminated) is type(truncated) is bool
-        if terminated or truncated:
-            ends[agent] = (terminated, truncated)
-            env.step(None)
-        else:
-            env.step(answer(seed, agent, decided.count(agent)))
-            decided.append(agent)
-        booked.update(env.rewards)
-    assert {a: t for a, t in booked.items() if t} == {a: t for a, t in totals.items() if t}
-    return decided, totals, ends
 
 
 @given(designs, seeds)

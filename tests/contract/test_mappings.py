@@ -22,7 +22,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes
-from tests.worlds.models import play
+from tests.worlds.models import begun, play
 
 DEAL = f"{__name__}.Dealer.deal"
 LEAVE = f"{__name__}.Dealer.leave"
@@ -106,9 +106,8 @@ def last_choice(agent, env):
     ("title", "pay", "earned"),
     [("here", pay, [0, 2, 4, 6]), ("there", difference(pay), [0, 2, 2, 2])],
 )
-def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned) -> None:
-    other = aec_env(Market("elsewhere"), points())
-    other.reset()
+def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned):
+    other = begun(aec_env(Market("elsewhere"), points()))
     env = aec_env(Market(title), points(reward_mapping=pay))
     turns = play(env, last_choice, seed=5)
     assert [turn.agent for turn in turns] == [f"{title}_0", f"{title}_1"] * 3 + [
@@ -120,12 +119,12 @@ def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay,
     ]
     assert mine == list(zip([[0, 5], [1, 5], [2, 5], [2, 5]], earned, strict=True))
     assert [turn.terminated for turn in turns] == [False] * 6 + [True] * 2
-    assert env.unwrapped.simulation.log == [(title, "low")] * 2 + [(title, "high")] * 4
+    assert env.simulation.log == [(title, "low")] * 2 + [(title, "high")] * 4
     other.step(0)
-    assert other.unwrapped.simulation.log == [("elsewhere", "low")]
+    assert other.simulation.log == [("elsewhere", "low")]
 
 
-def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation() -> None:
+def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation():
     changes = {
         "choices": None,
         "apply": None,
@@ -150,10 +149,10 @@ def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation() -> No
     assert info["rule_action"] == 1
     env.step(1)
     rule = ("rule", "low")
-    assert env.unwrapped.simulation.log == [("market", 0), rule, rule, rule, ("market", 1), rule]
+    assert env.simulation.log == [("market", 0), rule, rule, rule, ("market", 1), rule]
 
 
-def test_mappings_get_the_simulation_in_every_view_and_runner() -> None:
+def test_mappings_get_the_simulation_in_every_view_and_runner():
     roster = {"possible_agents": ["market_0", "market_1"]}
     parallel = parallel_env(Market, points(), **roster)
     assert parallel.reset(seed=2)[0]["market_1"].tolist() == [0, 2]
@@ -175,20 +174,19 @@ def test_mappings_get_the_simulation_in_every_view_and_runner() -> None:
     assert made.observations[:, 1].tolist() == [0] * 6 + [1] * 6 + [2] * 6
 
 
-def test_mappings_of_a_copy_get_its_own_simulation() -> None:
-    env = aec_env(Market, points())
-    env.reset()
+def test_mappings_of_a_copy_get_its_own_simulation():
+    env = begun(aec_env(Market, points()))
     env.close()
     again = pickle.loads(pickle.dumps(env))
     assert str(play(again, last_choice, seed=5)) == str(play(env, last_choice, seed=5))
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 2])
-def test_mappings_keep_no_simulation_alive(episodes) -> None:
+def test_mappings_keep_no_simulation_alive(episodes):
     env = aec_env(Market, points())
     for _ in range(episodes):
         env.reset(seed=1)
-    simulation = weakref.ref(env.unwrapped.simulation)
+    simulation = weakref.ref(env.simulation)
     env.close()
     del env
     gc.collect()

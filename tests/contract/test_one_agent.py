@@ -33,7 +33,8 @@ from simenv_marl.errors import (
 from tests.worlds.counters import same
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, play
+from tests.worlds.marks import EVERY_VIEW
+from tests.worlds.models import begun, calling, decision, play
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}
@@ -101,7 +102,7 @@ def zeros():
 
 
 def moves_of(env, agent):
-    return [move for name, move in env.unwrapped.simulation.log if name == agent]
+    return [move for name, move in env.simulation.log if name == agent]
 
 
 MOVE = {f"{PLACE}.move": definition()}
@@ -138,7 +139,7 @@ def episode(env):
     [(None, [1, 3, 1, 2, 1, 1]), ({"player_blue": lambda observation: 0}, [1] * 6)],
     ids=["their rule", "policies"],
 )
-def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) -> None:
+def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves):
     env = single_env(Game, MOVE, agent="player_red", policies=policies)
     steps, offers = episode(env)
     assert offers == [1, 3, 1, 2, 1, 1]
@@ -149,18 +150,24 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) ->
         env.step(0)
 
 
-def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
+def test_an_agent_with_a_name_of_its_own_is_one_of_several_points():
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
-    env = single_env(
-        Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE}
+    env = begun(
+        single_env(
+            Casino,
+            NAMED,
+            agent="mover",
+            possible_agents=["mover", "better"],
+            policies={"better": RULE},
+        ),
+        0,
     )
-    env.reset(seed=0)
     while not env.step(0)[2]:
         pass
     assert env.simulation.log == [(5, 1), (5, 1)]
 
 
-def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> None:
+def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs():
     named = {
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
@@ -168,13 +175,12 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> N
     with pytest.raises(AgentError, match="possible_agents"):
         single_env(Casino, named, agent="player_red")
     roster = {f"{PLACE}.move": NAMES, f"{PLACE}.bet": [f"{name}_bet" for name in NAMES]}
-    env = single_env(Casino, named, agent="player_red_bet", possible_agents=roster)
-    env.reset(seed=0)
+    env = begun(single_env(Casino, named, agent="player_red_bet", possible_agents=roster), 0)
     assert env.step(1)[2]
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did() -> None:
+def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did():
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
@@ -231,12 +237,12 @@ def simulated(simulation, points, **options):
 )
 def test_only_the_single_view_takes_an_agent_and_needs_one_of_many(
     make, simulation, points, options, error, match
-) -> None:
+):
     with pytest.raises(error, match=match):
         make(simulation, points, **options)
 
 
-def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
+def test_all_that_makes_single_views_takes_the_name_of_the_agent():
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
@@ -252,7 +258,7 @@ def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
 # -- skip_forced= ---------------------------------------------------------------------------------
 
 
-def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> None:
+def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up():
     steps, _ = episode(single_env(Game, MOVE, agent="player_red"))
     env = single_env(Game, MOVE, agent="player_red", skip_forced=True)
     skipped, offers = episode(env)
@@ -264,7 +270,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> 
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
+def test_forced_moves_ask_neither_the_user_nor_a_policy():
     asked = []
 
     def policy(observation, info):
@@ -287,7 +293,7 @@ def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
     assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
-def test_in_rounds_forced_moves_use_no_action() -> None:
+def test_in_rounds_forced_moves_use_no_action():
     env, joint = parallel_env(Game, MOVE, **ROSTER), joint_env(Game, MOVE, **ROSTER)
     env.reset(seed=0)
     joint.reset(seed=0)
@@ -296,7 +302,7 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
         assert terminations == dict.fromkeys(NAMES, ended)
         assert {name: info["acted"] for name, info in infos.items()} == dict.fromkeys(NAMES, True)
         assert joint.step(zeros())[2] == ended
-    assert [move for _, move in env.unwrapped.simulation.log] == [1] * 12
+    assert [move for _, move in env.simulation.log] == [1] * 12
 
 
 @pytest.mark.parametrize(
@@ -318,16 +324,15 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
     ],
     ids=["a space of one action", "several parts"],
 )
-def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
+def test_there_are_forced_moves_without_choices(changes, asked, moves):
     points = {f"{PLACE}.move": definition(choices=None, **changes)}
-    env = single_env(Game, points, agent="player_red", skip_forced=True)
-    env.reset(seed=0)
+    env = begun(single_env(Game, points, agent="player_red", skip_forced=True), 0)
     for action in asked:
         env.step(action)
     assert moves_of(env, "player_red") == moves
 
 
-def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
+def test_an_episode_of_forced_moves_alone_ends_at_the_first_step():
     env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
     for _ in range(2):
         observation, _ = env.reset(seed=0)
@@ -339,8 +344,7 @@ def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
     assert {turn.agent: turn[2:5] for turn in play(aec)} == dict.fromkeys(NAMES, (3.0, True, False))
     with pytest.raises(EpisodeOverError):
         aec.step(0)
-    parallel = parallel_env(Forced, MOVE, **ROSTER)
-    parallel.reset(seed=0)
+    parallel = begun(parallel_env(Forced, MOVE, **ROSTER), 0)
     assert parallel.agents == list(NAMES)
     assert parallel.step(zeros())[2] == dict.fromkeys(NAMES, True)
     actions = np.zeros(2, np.int64)
@@ -348,8 +352,7 @@ def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
         (RED | {"skip_forced": True}, actions, 3.0),
         (ROSTER | {"view": "joint"}, dict.fromkeys(NAMES, actions), 4.0),
     ):
-        vector = vector_env(Forced, MOVE, num_envs=2, **options)
-        vector.reset(seed=0)
+        vector = begun(vector_env(Forced, MOVE, num_envs=2, **options), 0)
         for ended in (True, False, True):
             _, rewards, terminations, *_ = vector.step(action)
             assert terminations.tolist() == [ended] * 2
@@ -367,8 +370,7 @@ def flown(make, space, action, *, clip_actions=True):
     """The argument of the mapping of agent ``pilot``, or of the last one among several."""
     taken = []
     fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
-    env = make(calling(fly), fly, clip_actions=clip_actions)
-    env.reset(seed=0)
+    env = begun(make(calling(fly), fly, clip_actions=clip_actions), 0)
     try:
         env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
     except InvalidActionError:
@@ -379,7 +381,7 @@ def flown(make, space, action, *, clip_actions=True):
     return taken[-1]
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@EVERY_VIEW
 @pytest.mark.parametrize(
     ("space", "action", "expected"),
     [
@@ -394,13 +396,11 @@ def flown(make, space, action, *, clip_actions=True):
         ),
     ],
 )
-def test_actions_outside_a_box_are_clipped_with_the_option_alone(
-    make, space, action, expected
-) -> None:
-    taken = flown(make, space, action)
+def test_actions_outside_a_box_are_clipped_with_the_option_alone(view, space, action, expected):
+    taken = flown(view, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
     with pytest.raises(InvalidActionError):
-        flown(make, space, action, clip_actions=False)
+        flown(view, space, action, clip_actions=False)
 
 
 @pytest.mark.parametrize(
@@ -420,12 +420,12 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_actions_that_cannot_be_clipped_are_refused(space, wrong) -> None:
+def test_actions_that_cannot_be_clipped_are_refused(space, wrong):
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 
 
-def test_the_vector_view_clips_as_the_single_view_does() -> None:
+def test_the_vector_view_clips_as_the_single_view_does():
     two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
     assert same(
@@ -438,7 +438,7 @@ def test_the_vector_view_clips_as_the_single_view_does() -> None:
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
+def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round():
     """The first being has no choice and is out before the second one is asked."""
     program = (
         "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2,"
@@ -447,28 +447,24 @@ def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or
     points = beings(choices=lambda being: [1] if being.number == 0 else [1, 2])
     one = {"agent": "being_0", "skip_forced": True}
     both = {"possible_agents": ["being_0", "being_1"], "skip_forced": True}
-    env = parallel_env(life(program), points, **both)
-    env.reset(seed=1)
+    env = begun(parallel_env(life(program), points, **both), 1)
     assert sorted(env.agents) == ["being_0", "being_1"]
     _, rewards, terminations, _, _ = env.step({"being_0": 0, "being_1": 0})
     assert rewards == {"being_0": 2.0, "being_1": 1.0}
     assert terminations == {"being_0": True, "being_1": False}
     assert env.agents == ["being_1"]
-    joint = joint_env(life(program), points, **both)
-    joint.reset(seed=1)
+    joint = begun(joint_env(life(program), points, **both), 1)
     assert joint.step({"being_0": 0, "being_1": 0})[1] == 3.0
-    single = single_env(life(program), points, **one)
-    single.reset(seed=1)
+    single = begun(single_env(life(program), points, **one), 1)
     assert single.step(0)[1:4] == (3.0, True, False)
-    vector = vector_env(life(program), points, num_envs=2, **one)
-    vector.reset(seed=1)
+    vector = begun(vector_env(life(program), points, num_envs=2, **one), 1)
     _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
     assert (rewards.tolist(), terminations.tolist()) == ([3.0, 3.0], [True, True])
     vector.close()
 
 
 @pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
-def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
+def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies):
     program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
     env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):

@@ -1,7 +1,5 @@
 """Random simulations, compared with what was computed without the library."""
 
-from typing import Any
-
 import pytest
 from hypothesis import given, settings
 
@@ -9,7 +7,6 @@ from simenv_marl import RULE, aec_env
 from simenv_marl.errors import EpisodeOverError
 from tests.worlds.models import play
 from tests.worlds.worlds import (
-    Design,
     Reference,
     World,
     advised,
@@ -21,7 +18,7 @@ from tests.worlds.worlds import (
 )
 
 
-def made(design: Design) -> Any:
+def made(design):
     """An environment of a design."""
     points = points_of(design)
     policies = {points[point]: advised for point in design.policies} | {
@@ -32,9 +29,9 @@ def made(design: Design) -> Any:
     )
 
 
-def agrees(env: Any, reference: Reference) -> None:
+def agrees(env, reference):
     """An AEC environment that stands where the reference does says what the reference says."""
-    assert env.unwrapped.simulation.trace == reference.trace
+    assert env.simulation.trace == reference.trace
     if reference.ends is None:
         told = reference.turns[-1]
         assert env.agent_selection == told.agent
@@ -64,9 +61,9 @@ def agrees(env: Any, reference: Reference) -> None:
 def test_an_episode_is_what_was_computed_without_the_library(design, seed, given_answers):
     """Also the rewards that each step books: none is lost or counted twice."""
     env = made(design)
-    booked: dict[str, float] = {}
+    booked = {}
     env.reset(seed=seed)
-    used: list[Any] = []
+    used = []
     while True:
         reference = Reference(design, seed, used)
         agrees(env, reference)

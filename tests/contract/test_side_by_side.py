@@ -10,7 +10,7 @@ import pytest
 import simpy
 
 from simenv_marl import RULE, aec_env, difference, single_env
-from tests.worlds.models import calling, decision, decisions, play, script, stacks, unwinding
+from tests.worlds.models import begun, calling, decision, decisions, play, script, stacks, unwinding
 
 # -- nested ---------------------------------------------------------------------------------------
 
@@ -26,7 +26,7 @@ def run_inner(env, action):
     env.reset()
     while not env.step(action)[2]:
         pass
-    return env.unwrapped.simulation.log
+    return env.simulation.log
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_rules_mappings_and_policies_may_run_an_environment_of_their_own(place):
     # point.
     asked = ["outer_0", "other_0", "outer_0", "inner_0"]
     assert decisions(turns) == [agent for agent in asked if place != "policy" or agent != "outer_0"]
-    assert env.unwrapped.simulation.log == [7, 7, 7, 7]
+    assert env.simulation.log == [7, 7, 7, 7]
     assert logs
     assert all(log == [[4, 4, 4], ["inner rule"] * 3] for log in logs)
 
@@ -72,8 +72,7 @@ def test_errors_pass_through_environments_that_are_nested_deeply():
         run_inner(single_env(calling(decide), decide), RULE)
 
     outer = decision(lambda: nested(5), agent="outer_0")
-    env = single_env(calling(outer), outer)
-    env.reset()
+    env = begun(single_env(calling(outer), outer))
     with pytest.raises(ZeroDivisionError) as caught:
         env.step(RULE)
     agents = [re.search(r"(deep|outer)_\d", note)[0] for note in caught.value.__notes__]
@@ -93,8 +92,7 @@ def test_a_suspended_nest_is_collected():
         finally:
             unwound.append("outer")
 
-    env = single_env(script(main), outer)
-    env.reset()
+    env = begun(single_env(script(main), outer))
     del env
     assert not stacks(before)
     assert sorted(unwound) == ["outer", "unwound"]
@@ -102,11 +100,10 @@ def test_a_suspended_nest_is_collected():
 
 def test_environments_may_be_stepped_from_greenlets_of_the_user():
     decide = decision()
-    env = single_env(calling(*[decide] * 6), decide)
-    env.reset()
+    env = begun(single_env(calling(*[decide] * 6), decide))
     for number in range(6):
         assert greenlet.greenlet(env.step).switch(number)[2] == (number == 5)
-    assert env.unwrapped.simulation.log == list(range(6))
+    assert env.simulation.log == list(range(6))
 
 
 # -- SimPy ----------------------------------------------------------------------------------------
@@ -127,8 +124,7 @@ def test_simpy_models_unwind(how):
         env = simpy.Environment()
         env.run(env.all_of([env.process(process(env, n)) for n in range(3)]))
 
-    gym = single_env(script(main), decide)
-    gym.reset()
+    gym = begun(single_env(script(main), decide))
     if how == "error":
         # SimPy keeps the error of a process until those that wait for it are told
         for n in range(2):
@@ -167,9 +163,9 @@ def test_greenlets_of_the_model_may_decide_and_unwind(how):
 
     env = aec_env(script(main), decide)
     if how == "end":
-        turns = play(env, lambda agent, env: len(env.unwrapped.simulation.log))
+        turns = play(env, lambda agent, env: len(env.simulation.log))
         assert decisions(turns) == ["a_0", "b_0", "m_0"] * 2 + ["m_0"]
-        assert env.unwrapped.simulation.log == [0, 1, 2, 3, 4, 5, None, None, 8]
+        assert env.simulation.log == [0, 1, 2, 3, 4, 5, None, None, 8]
     else:
         env.reset()
         for number in range(4):
@@ -208,10 +204,9 @@ def test_models_that_use_asyncio_run_side_by_side_whatever_is_decided_in_each():
         for env in envs:
             if env.agents:
                 env.step(None if env.last()[2] else RULE)
-    plain = office()
-    plain.reset()
+    plain = begun(office())
     plain.run()
-    assert [env.unwrapped.simulation.log for env in envs] == [plain.log] * 3
+    assert [env.simulation.log for env in envs] == [plain.log] * 3
     turns = play(envs[2], {"clerk_0": iter([3, 2, 1, 0]), "boss_0": 7})
     assert envs[2].unwrapped.simulation.log == [(3, 0, 7), (2, 1, 7), (1, 2, 7), (0, 3, 7)]
     assert sorted(decisions(turns)) == ["boss_0"] * 4 + ["clerk_0"] * 4
@@ -228,8 +223,7 @@ def test_models_may_recurse_as_deeply_as_without_an_environment():
         return decide() if depth == 0 else dive(depth - 1)
 
     depth = sys.getrecursionlimit() - 200
-    env = single_env(calling(*[lambda: dive(depth)] * 2), decide)
-    env.reset()
+    env = begun(single_env(calling(*[lambda: dive(depth)] * 2), decide))
     env.step(1)
     env.step(2)
-    assert env.unwrapped.simulation.log == [1, 2]
+    assert env.simulation.log == [1, 2]

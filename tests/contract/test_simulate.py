@@ -28,7 +28,8 @@ from tests.worlds.many_worlds import (
     designs,
     seeds,
 )
-from tests.worlds.models import calling, decision, notes, script
+from tests.worlds.models import calling, decision, script
+from tests.worlds.undone import fails
 
 
 def test_without_policies_it_is_the_plain_run_of_a_copy():
@@ -69,9 +70,8 @@ def test_errors_name_the_seed():
             "division",
         ),
     ):
-        with pytest.raises(error, match=match) as caught:
+        with fails(error, "seed 13", match=match):
             simulate(source, {ANT: policy}, seed=13)
-        assert "seed 13" in notes(caught.value)
 
 
 @pytest.mark.parametrize("run", [simulate, partial(simulate_many, seeds=[1])], ids=["one", "many"])
@@ -161,14 +161,6 @@ def test_many_simulations_may_declare_possible_agents(workers):
         workers=workers,
     )
     assert [simulation.log for simulation in found] == [[4, 3]] * 3
-
-
-@pytest.mark.parametrize("run", [simulate, partial(simulate_many, seeds=[1])], ids=["one", "many"])
-def test_possible_agents_that_never_decide_are_warned_of(run):
-    source = script(lambda simulation: Being(0).act())
-    declared = ["being_0", "being_7"]
-    with pytest.warns(UserWarning, match="did not appear in the episode: being_7; .*being_0"):
-        run(source, {Being.act: lambda seen: RULE}, points=beings(), possible_agents=declared)
 
 
 @pytest.mark.parametrize("action", [1, RULE])

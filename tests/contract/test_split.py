@@ -17,7 +17,7 @@ from simenv_marl import (
     single_env,
 )
 from simenv_marl.errors import DefinitionError
-from tests.worlds.models import decisions, define, follow_the_rule, play
+from tests.worlds.models import begun, decisions, define, follow_the_rule, play
 
 
 class Station:
@@ -73,7 +73,7 @@ PLAIN.reset(5)
 PLAIN.run()
 
 
-def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their_part_of_its_result():  # noqa: E501
+def test_items_decide_in_order_or_get_their_part_of_the_rules_result():
     env = aec_env(Day, points())
     day = follow_the_rule(env, seed=5)
     assert (day.log, day.grid.rules) == (PLAIN.log, 4)  # the rule runs once for a call
@@ -84,25 +84,10 @@ def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their
     assert env.simulation.grid.rules == 4
 
 
-def test_infos_have_the_part_of_each_item_in_what_the_rule_decided():
-    env = aec_env(Day, points(rule_action_mapping=int))
-    env.reset(seed=5)
-    seen = []
-    for _ in range(6):
-        seen.append(env.last()[4].get("rule_action"))
-        env.step(RULE)
-    assert seen == [None, None, None, *PLAIN.log[0]]
-
-
 def rule_actions(env, answers, seed=None):
     """Play an episode; return the action of the rule in each info, by agent."""
-    env.reset(seed=seed)
-    seen = []
-    for agent in env.agent_iter():
-        *_, terminated, truncated, info = env.last()
-        seen.append((agent, info.get("rule_action")))
-        env.step(None if terminated or truncated else answers[agent])
-    return seen
+    turns = play(env, answers, seed=seed)
+    return [(turn.agent, turn.info.get("rule_action")) for turn in turns]
 
 
 def test_only_items_that_the_rule_has_answered_have_its_action():
@@ -222,8 +207,7 @@ SEQUENCE = {
 
 
 def test_items_see_the_answers_to_the_items_before():
-    env = aec_env(Hospital, {Hospital.give: define(**SEQUENCE, action_mask_mapping=free)})
-    env.reset()
+    env = begun(aec_env(Hospital, {Hospital.give: define(**SEQUENCE, action_mask_mapping=free)}))
     seen = []
     for agent in env.agent_iter(6):
         observation, *_, info = env.last()
@@ -249,8 +233,7 @@ def test_answers_are_choices_actions_of_apply_or_the_rule():
         {"action_space": spaces.Discrete(3), "apply": lambda action, name: f"bed {action}"},
     ):
         got.clear()
-        env = aec_env(Hospital, {Hospital.give: define(**given, **changes)})
-        env.reset()
+        env = begun(aec_env(Hospital, {Hospital.give: define(**given, **changes)}))
         for action in (1, RULE, 2):
             env.step(action)
         first = "q" if "choices" in changes else 1
@@ -273,15 +256,12 @@ def test_answers_are_given_to_split_calls_alone():
 
 
 def test_all_views_and_policies_answer_items():
-    env = parallel_env(Day, points())
-    env.reset(seed=5)
+    env = begun(parallel_env(Day, points()), 5)
     rewards = env.step({"s_0": 3, "s_1": 4, "s_2": 5})[1]
     assert (env.simulation.log, rewards) == ([(3, 4, 5)], {"s_0": 3.0, "s_1": 4.0, "s_2": 5.0})
-    joint = joint_env(Day, points())
-    joint.reset(seed=5)
+    joint = begun(joint_env(Day, points()), 5)
     assert joint.step({"s_0": 3, "s_1": 4, "s_2": 5})[1] == 12.0
-    one = single_env(Day, points(), agent="s_1")
-    one.reset(seed=5)
+    one = begun(single_env(Day, points(), agent="s_1"), 5)
     one.step(8)
     assert one.simulation.log == [(first, 8, last) for first, _, last in PLAIN.log[:1]]
     assert (
@@ -294,8 +274,7 @@ def test_all_views_and_policies_answer_items():
 
 
 def test_branches_and_ends_amid_a_call_are_exact_and_leave_nothing():
-    env = aec_env(Day, points())
-    env.reset(seed=5)
+    env = begun(aec_env(Day, points()), 5)
     env.step(7)
     assert (
         branch(
@@ -370,10 +349,12 @@ def under_another_factor(action, clinic, days, *, _rule):
 
 
 def test_apply_runs_the_rule_under_other_parameters_and_its_own_calls_do_not_ask_again():
-    env = single_env(
-        Clinic, {Clinic.stay: define(action_space=spaces.Discrete(9), apply=under_another_factor)}
+    env = begun(
+        single_env(
+            Clinic,
+            {Clinic.stay: define(action_space=spaces.Discrete(9), apply=under_another_factor)},
+        )
     )
-    env.reset()
     for action in (3, RULE, 4):
         env.step(action)
     assert env.simulation.log == [3, 2, 20]

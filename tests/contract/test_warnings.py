@@ -14,7 +14,6 @@ import pytest
 
 from simenv_marl import (
     RULE,
-    SimulationInterface,
     aec_env,
     parallel_env,
     simulate,
@@ -24,7 +23,9 @@ from simenv_marl import (
 )
 from simenv_marl.core.switching import generators as rng
 from simenv_marl.errors import UnknownPointError
-from tests.worlds.models import calling, decision, define, script
+from tests.worlds.lives import life, story
+from tests.worlds.many_worlds import HERE, Being, beings
+from tests.worlds.models import begun, calling, decision, define, script
 from tests.worlds.models import play as play_in_turns
 
 DRAWS = "draws from the global generator"
@@ -85,7 +86,7 @@ def play(env, draw=lambda: None):
     ],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
-def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset) -> None:
+def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset):
     kind = gambler(draw, in_reset=in_reset)
     for make in (single_env, aec_env):
         for _ in range(2):
@@ -103,12 +104,12 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
     ),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-def test_all_runners_warn(heard_alone, run) -> None:
+def test_all_runners_warn(heard_alone, run):
     run(gambler(random.random))
     assert len(heard_alone(DRAWS)) == 1
 
 
-def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard) -> None:
+def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard):
     def draw():
         return random.random() + np.random.random()
 
@@ -127,7 +128,7 @@ def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard) -> None:
     assert heard(DRAWS) == []
 
 
-def test_draws_of_other_threads_cause_no_warning(heard) -> None:
+def test_draws_of_other_threads_cause_no_warning(heard):
     over, draws_going_on = threading.Event(), threading.Event()
 
     def draw():
@@ -172,7 +173,7 @@ ANTS = hill("ant_0", "ant_1")
 )
 def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(
     heard, options, absent
-) -> None:
+):
     env = aec_env(ANTS, ant, **options)
     for _ in range(2):
         play_in_turns(env, seed=1)
@@ -183,7 +184,7 @@ def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode
     assert "ant_0, ant_1" in those_who_came
 
 
-def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
+def test_runners_tell_of_it_once_for_all_simulations(heard):
     policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
     simulate_many(ANTS, policies, seeds=range(5), points=ant)
     assert len(heard(ABSENT)) == 1
@@ -191,25 +192,25 @@ def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
     assert len(heard(ABSENT)) == 2
 
 
-def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> None:
+def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard):
     names = ["nest.1", "ant_0"]  # a dot makes no path
     play_in_turns(
         aec_env(
             hill(*names), ant, possible_agents=names, policies={"nest.1": lambda observation: 0}
         )
     )
-    env = aec_env(ANTS, ant, possible_agents=["ant_0", "ant_1", "ant_9"])
-    env.reset()
+    env = begun(aec_env(ANTS, ant, possible_agents=["ant_0", "ant_1", "ant_9"]))
     env.close()
     one, ruled = decision(agent="one_0"), decision(agent="ruled_0")
-    env = single_env(calling(one, ruled), [one, ruled], agent="one_0", policies={"ruled_0": RULE})
-    env.reset()
+    env = begun(
+        single_env(calling(one, ruled), [one, ruled], agent="one_0", policies={"ruled_0": RULE})
+    )
     env.step(0)
     assert heard(ABSENT) == []
 
 
 @pytest.mark.parametrize("slip", ["threading.Thread.strat", f"{__name__}.Missing.step"])
-def test_policies_for_names_without_a_function_are_refused(slip) -> None:
+def test_policies_for_names_without_a_function_are_refused(slip):
     with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
         aec_env(ANTS, ant, policies={slip: lambda observation: 0})
 
@@ -217,9 +218,8 @@ def test_policies_for_names_without_a_function_are_refused(slip) -> None:
 # -- rounds that stand still ----------------------------------------------------------------------
 
 
-def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> None:
-    env = parallel_env(ANTS, ant, possible_agents=["ant_0", "ant_1"])
-    env.reset(seed=1)
+def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard):
+    env = begun(parallel_env(ANTS, ant, possible_agents=["ant_0", "ant_1"]), 1)
     for number in range(150):
         env.step({"ant_1": 1} if number % 2 else {})
         assert len(heard("stands still")) == (number >= 99)
@@ -230,10 +230,9 @@ def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> 
     assert env.agents == []
 
 
-def test_turns_are_no_standstill(heard) -> None:
+def test_turns_are_no_standstill(heard):
     one, two = decision(agent="one"), decision(agent="two")
-    env = parallel_env(calling(*[one, two] * 400), [one, two])
-    env.reset(seed=1)
+    env = begun(parallel_env(calling(*[one, two] * 400), [one, two]), 1)
     for number in range(600):
         # Two rounds of three leave the pending agent out.
         env.step({("one", "two")[number // 3 % 2]: 1} if number % 3 == 0 else {})
@@ -279,22 +278,21 @@ OVERRIDE = "objects of these classes are no agents"
 DRAIN = f"{__name__}.Tank.drain"
 
 
-def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard) -> None:
-    env = aec_env(tanks(Tank, Deaf), {DRAIN: define()})
-    env.reset()
+def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard):
+    env = begun(aec_env(tanks(Tank, Deaf), {DRAIN: define()}))
     env.step(1)
     assert not heard(OVERRIDE)
     env.step(1)
     (text,) = heard(OVERRIDE)
     assert f"{__name__}.Deaf.drain override {DRAIN}" in text
-    assert env.unwrapped.simulation.log == [1, 1, "deaf", "deaf"]
+    assert env.simulation.log == [1, 1, "deaf", "deaf"]
     play_in_turns(env, 1)
     assert len(heard(OVERRIDE)) == 1
     env.close()
     assert not hasattr(Deaf.drain, "__wrapped__")
 
 
-def test_a_static_function_that_overrides_a_point_is_warned_of(heard) -> None:
+def test_a_static_function_that_overrides_a_point_is_warned_of(heard):
     model = calling(lambda: Tank.fill(1), lambda: Deaf.fill(2))
     assert simulate(model, {}, points={f"{__name__}.Tank.fill": define()}).log == ["rule", "deaf"]
     assert not heard(OVERRIDE)  # the rule decides everywhere
@@ -312,99 +310,60 @@ def test_a_static_function_that_overrides_a_point_is_warned_of(heard) -> None:
         (tanks(Tank, Deaf), {DRAIN: define(), f"{__name__}.Deaf.drain": define()}),
     ],
 )
-def test_an_override_that_decides_is_not_warned_of(model, points, heard) -> None:
+def test_an_override_that_decides_is_not_warned_of(model, points, heard):
     play_in_turns(aec_env(model, points), 1)
     assert not heard(OVERRIDE)
 
 
-def test_an_override_may_run_in_a_thread_of_the_model(heard) -> None:
+def test_an_override_may_run_in_a_thread_of_the_model(heard):
     def main(simulation):
         thread = threading.Thread(target=lambda: simulation.log.append(Deaf().drain()))
         thread.start()
         thread.join()
         simulation.log.append(Tank().drain())
 
-    env = single_env(script(main), {DRAIN: define()})
-    env.reset()
+    env = begun(single_env(script(main), {DRAIN: define()}))
     env.step(4)
-    assert env.unwrapped.simulation.log == ["deaf", 4]
+    assert env.simulation.log == ["deaf", 4]
 
 
 # -- names of agents, and functions that end them -------------------------------------------------
 
 
-class Ant(SimulationInterface):
-    """Two ants decide; one may die, and the names of agents that end are given."""
-
-    ending = ()
-    dies = False
-
-    def reset(self):
-        self.ants = [Worker(0), Worker(1)]
-
-    def run(self):
-        for ant in self.ants:
-            ant.work()
-        for name in self.ending:
-            self.end_agent(name)
-        if self.dies:
-            self.ants[1].die()
-        self.ants[0].work()
-
-
-class Worker:
-    def __init__(self, number):
-        self.number = number
-
-    def work(self):
-        return "rule"
-
-    def die(self):
-        pass
-
-    def starve(self):
-        pass
-
-
-def colony(**changes):
-    given = {"agent": lambda ant: f"ant_{ant.number}", **changes}
-    return {f"{__name__}.Worker.work": define(**given)}
-
-
-def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard) -> None:
-    for ending, expected in [(["ant_1"], 0), (["ant_1", "ant_1", None], 0), (["ant_7", "bee"], 1)]:
-        env = aec_env(type("Own", (Ant,), {"ending": ending}), colony())
+def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard):
+    for ending, expected in [("1 ends", 0), ("1 ends, 1 ends", 0), ("7 ends, 8 ends", 1)]:
+        env = aec_env(life(f"0 acts, 1 acts, {ending}, 0 acts"), beings())
         play_in_turns(env, 1)
         play_in_turns(env, 1)
         texts = heard("has no effect, because no agent has had this name")
         assert len(texts) == expected
-    assert "end_agent('ant_7')" in texts[0]
-    assert "these have: ant_0, ant_1" in texts[0]
+    assert "end_agent('being_7')" in texts[0]
+    assert "these have: being_0, being_1" in texts[0]
 
 
-def test_declared_agents_may_end_before_they_decide(heard) -> None:
-    env = aec_env(
-        type("Own", (Ant,), {"ending": ["ant_2"]}),
-        colony(),
-        possible_agents=["ant_0", "ant_1", "ant_2"],
-    )
+def test_declared_agents_may_end_before_they_decide(heard):
+    roster = ["being_0", "being_1", "being_2"]
+    env = aec_env(life("0 acts, 1 acts, 2 ends, 0 acts"), beings(), possible_agents=roster)
     play_in_turns(env, 1)
     assert not heard("has no effect")
 
 
-def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard) -> None:
-    env = aec_env(Ant, colony(agent=lambda ant: "ant"))
+PAIR, DYING = life("0 acts, 1 acts, 0 acts"), life("0 acts, 1 acts, 1 leaves, 0 acts")
+
+
+def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard):
+    env = aec_env(PAIR, beings(agent=lambda being: "ant"))
     play_in_turns(env, 1)
     play_in_turns(env, 1)
     (text,) = heard("several objects decide at")
     assert "'ant'" in text
-    play_in_turns(aec_env(Ant, colony()), 1)
-    play_in_turns(aec_env(type("Own", (Ant,), {"dies": True}), colony()), 1)
+    play_in_turns(aec_env(PAIR, beings()), 1)
+    play_in_turns(aec_env(DYING, beings()), 1)
     assert len(heard("several objects decide at")) == 1
 
 
 @pytest.mark.parametrize("deciders", [{}, {"one": lambda _: 1}])
-def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard) -> None:
+def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard):
     class Yard:
         def allot(self):
             return [0, 0, 0, 0]
@@ -427,30 +386,27 @@ def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard) 
     assert "as one agent, 'one'" in text
 
 
-@pytest.mark.parametrize("key", [Worker.die, f"{__name__}.Worker.die"])
+LEAVE = f"{HERE}.Being.leave"
+
+
+@pytest.mark.parametrize("key", [Being.leave, LEAVE])
 @pytest.mark.parametrize("form", [lambda key: key, lambda key: [key], lambda key: {key: None}])
-def test_functions_that_end_agents_are_named_as_points_are(key, form, heard) -> None:
-    dying = type("Own", (Ant,), {"dies": True})
-    env = aec_env(dying, colony(removed_by=form(key)))
+def test_functions_that_end_agents_are_named_as_points_are(key, form, heard):
+    env = aec_env(DYING, beings(removed_by=form(key)))
     for _ in range(2):
-        turns = play_in_turns(env, 1)
-        assert [turn.agent for turn in turns if turn.terminated] == ["ant_1", "ant_0"]
-        assert [turn.agent for turn in turns] == ["ant_0", "ant_1", "ant_1", "ant_0", "ant_0"]
+        assert story(play_in_turns(env, 1)) == "0 1 1+ 0 0+"
     assert not heard("removed_by= of")
     copied = pickle.loads(cloudpickle.dumps(env))
     assert len(play_in_turns(copied, 1)) == 5
 
 
-def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard) -> None:
-    starves = f"{__name__}.Worker.starve"
-    env = aec_env(Ant, colony(removed_by=starves))
-    env.reset()
+def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard):
+    env = begun(aec_env(PAIR, beings()))
     env.close()
     assert not heard("removed_by= of")
     play_in_turns(env, 1)
     play_in_turns(env, 1)
     (text,) = heard("removed_by= of")
-    assert f"removed_by= of {__name__}.Worker.work names {starves}, which the model did not" in text
-    dying = type("Own", (Ant,), {"dies": True})
-    play_in_turns(aec_env(dying, colony(removed_by=[starves, Worker.die])), 1)
+    assert f"removed_by= of {HERE}.Being.act names {LEAVE}, which the model did not" in text
+    play_in_turns(aec_env(DYING, beings(removed_by=[f"{HERE}.banish", Being.leave])), 1)
     assert len(heard("removed_by= of")) == 1

@@ -18,7 +18,17 @@ from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.processes import run_code
-from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
+from tests.worlds.marks import EVERY_DRIVER
+from tests.worlds.models import (
+    Script,
+    begun,
+    calling,
+    culprits,
+    decision,
+    nobody_is_asked,
+    notes,
+    script,
+)
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 REFUSED = "choose was called in a thread that the simulation has started"
@@ -39,8 +49,8 @@ def _nobody_is_running_afterwards():
 # -- 5.0: one stack of its own, kept over the episodes --------------------------------------------
 
 
-@DRIVERS
-def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver):
+@EVERY_DRIVER
+def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context():
     variable = contextvars.ContextVar("variable", default="nobody's")
     seen = []
 
@@ -73,7 +83,7 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
             look()
 
     decide = decision()
-    env = single_env(Engine, decide, driver=driver)
+    env = single_env(Engine, decide)
     for user in ("one", "two", "after it was closed"):
         token = variable.set(user)
         for _ in range(2):
@@ -81,7 +91,7 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
             assert variable.get() == user
             for action in (1, 2, RULE):
                 env.step(action)
-            assert env.unwrapped.simulation.log == [
+            assert env.simulation.log == [
                 user,
                 "the model's",
                 1,
@@ -103,15 +113,14 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
 # -- threads --------------------------------------------------------------------------------------
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
+def test_other_threads_run_rules_and_environments_meanwhile(inner):
     decide, other = decision(), decision(lambda: "its rule")
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
     def use():
-        env = single_env(calling(deeper, deeper), deeper, driver=inner)
-        env.reset()
+        env = begun(single_env(calling(deeper, deeper), deeper, driver=inner))
         return [env.step(1)[1:3], env.step(2)[1:3], env.simulation.log]
 
     with ThreadPoolExecutor(1) as pool:
@@ -121,8 +130,7 @@ def test_other_threads_run_rules_and_environments_meanwhile(driver, inner):
             lambda: in_a_thread(other),  # which is no point of the environment
             lambda: in_a_thread(use),
         ]
-        env = single_env(calling(decide, *functions, decide), decide, driver=driver)
-        env.reset()
+        env = begun(single_env(calling(decide, *functions, decide), decide))
         env.step(1)
         env.step(2)
     assert env.simulation.log == [1, "rule", "its rule", [(1.0, False), (1.0, True), [1, 2]], 2]
@@ -141,10 +149,10 @@ WAYS = {
 }
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
+def test_decisions_in_threads_of_the_model_fail_the_step(way, last):
     def work():
         roots.append(weakref.ref(greenlet.getcurrent()))
         decide()
@@ -158,8 +166,7 @@ def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
             simulation.log.append(decide())
 
     roots, decide = [], decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset(seed=5)
+    env = begun(single_env(script(main), decide), 5)
     with pytest.raises(WrongThreadError, match=REFUSED) as caught:
         env.step(1)
     assert env.simulation.log == [1, "refused"]
@@ -173,8 +180,8 @@ def test_decisions_in_threads_of_the_model_fail_the_step(driver, way, last):
     assert root() is None or not gc.get_referrers(root())
 
 
-@DRIVERS
-def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
+@EVERY_DRIVER
+def test_a_refusal_is_raised_once_or_noted_on_another_error():
     def passed_on():
         return by_pool(decide)
 
@@ -185,8 +192,7 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
 
     decide = decision()
     for function, kind in ((passed_on, WrongThreadError), (followed_by_another, KeyError)):
-        env = single_env(calling(decide, function), decide, driver=driver)
-        env.reset()
+        env = begun(single_env(calling(decide, function), decide))
         with pytest.raises(kind) as caught:
             env.step(1)
         env.close()
@@ -198,9 +204,9 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
             assert len(caught.value.__notes__) == 1
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
-def test_decisions_in_threads_older_than_the_episode_are_refused(driver, how):
+def test_decisions_in_threads_older_than_the_episode_are_refused(how):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)
@@ -219,7 +225,7 @@ def test_decisions_in_threads_older_than_the_episode_are_refused(driver, how):
         decide()
 
     decide = decision()
-    env = single_env(Hiring, decide, driver=driver)
+    env = single_env(Hiring, decide)
     for _ in range(1 if how == "close" else 2):  # after a close the threads are those of nobody
         assert env.simulation.ask() == "rule"  # between episodes nobody would be asked anyway
         env.reset()

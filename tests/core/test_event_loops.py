@@ -12,7 +12,8 @@ import pytest
 from simenv_marl import SimulationInterface, single_env
 from simenv_marl.errors import SimulationError
 from tests.conftest import DRIVERS
-from tests.worlds.models import decision, script
+from tests.worlds.marks import EVERY_DRIVER
+from tests.worlds.models import begun, decision, script
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
@@ -113,9 +114,9 @@ def test_a_user_without_a_loop_keeps_generator_hooks_and_tracking(driver):
         sys.set_coroutine_origin_tracking_depth(0)
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("inside", [(), (1, 2, 3, 4, 5), (0, 1), (5,)])
-def test_a_users_loop_keeps_its_generator_hooks_and_tracking(driver, inside):
+def test_a_users_loop_keeps_its_generator_hooks_and_tracking(inside):
     """The reset and five steps are made inside a loop of the user's, or outside all."""
 
     async def act(move):
@@ -129,7 +130,7 @@ def test_a_users_loop_keeps_its_generator_hooks_and_tracking(driver, inside):
         return env.step(1)[2]
 
     decide = decision()
-    env = single_env(tracking(decide), decide, driver=driver)
+    env = single_env(tracking(decide), decide)
     moves = [env.reset, *[move] * 5]
     for _ in range(2):
         for number, moved in enumerate(moves):
@@ -163,9 +164,7 @@ def deciding(driver, interrupted=False):
         asyncio.run(work(simulation))
 
     decide = decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    return env
+    return begun(single_env(script(main), decide, driver=driver))
 
 
 @DRIVERS
@@ -228,16 +227,13 @@ async def waited(clerk):
     await asyncio.wait([asyncio.create_task(asyncio.wait_for(clerk(), 100)) for _ in range(3)])
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("way", [grouped, gathered, waited])
 @pytest.mark.parametrize("steps", [0, 1])
 @pytest.mark.parametrize("how", ["close", "reset", "collected"])
-def test_tasks_that_are_unwound_are_not_reported(driver, way, steps, how, loud):
+def test_tasks_that_are_unwound_are_not_reported(way, steps, how, loud):
     decide = decision()
-    env = single_env(
-        script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver
-    )
-    env.reset()
+    env = begun(single_env(script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide))
     for _ in range(steps):
         env.step(1)
     if how != "collected":
@@ -247,8 +243,8 @@ def test_tasks_that_are_unwound_are_not_reported(driver, way, steps, how, loud):
     assert told(loud) == []
 
 
-@DRIVERS
-def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
+@EVERY_DRIVER
+def test_errors_of_tasks_are_reported_while_others_are_unwound(loud):
     async def fail():
         raise ValueError
 
@@ -261,8 +257,7 @@ def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
             del keep
 
     decide = decision()
-    env = single_env(script(lambda simulation: asyncio.run(grouped(clerk))), decide, driver=driver)
-    env.reset()
+    env = begun(single_env(script(lambda simulation: asyncio.run(grouped(clerk))), decide))
     env.close()
     assert told(loud) == ["Task exception was never retrieved"]
     assert isinstance(loud.records[-1].exc_info[1], ValueError)
@@ -304,16 +299,16 @@ async def office(simulation, decide, cleanup):
     await asyncio.wait(tasks)
 
 
-@DRIVERS
+@EVERY_DRIVER
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_a_loop_of_the_model_cancels_its_tasks_at_the_end(driver, end):
+def test_a_loop_of_the_model_cancels_its_tasks_at_the_end(end):
     decide, cleanup = decision(), []
-    env = single_env(
-        script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),
-        decide,
-        driver=driver,
+    env = begun(
+        single_env(
+            script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),
+            decide,
+        )
     )
-    env.reset()
     log = env.simulation.log
     getattr(env, end)()
     assert sorted(log) == ["generator closed"] * 2 + ["task cancelled"] * 3
@@ -335,10 +330,10 @@ class Lasting(SimulationInterface):
         self.loop.run_until_complete(self.work())
 
 
-@DRIVERS
-def test_a_loop_that_lives_for_many_episodes_is_changed_once(driver, loud):
+@EVERY_DRIVER
+def test_a_loop_that_lives_for_many_episodes_is_changed_once(loud):
     decide, messages = decision(), []
-    env = single_env(lambda: Lasting(clerk_of(decide)), decide, driver=driver)
+    env = single_env(lambda: Lasting(clerk_of(decide)), decide)
     model = env.simulation
     model.loop.set_exception_handler(lambda loop, context: messages.append(context["message"]))
     for _ in range(10):
@@ -379,7 +374,7 @@ def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, n
 @pytest.mark.filterwarnings(
     "ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
-def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None:
+def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations():
     """A loop that outlives its episodes keeps their tasks and passes on their exit later."""
     decide, raised = decision(), None
     env = single_env(lambda: Lasting(partial(gathered, clerk_of(decide))), decide)

@@ -6,9 +6,10 @@ import threading
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import RULE, TRUNCATED, aec_env, simulate
 from simenv_marl.errors import OptionValueError, WrongThreadError
-from tests.worlds.models import define, play
+from tests.worlds.marks import EVERY_DRIVER, EVERY_VIEW
+from tests.worlds.models import begun, define, play
 
 
 class Casino:
@@ -37,7 +38,6 @@ class Casino:
         return random.choice("abc") + str(np.random.randint(100))
 
 
-DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 BET = f"{__name__}.Casino.bet"
 POINTS = {
     BET: define(
@@ -72,14 +72,11 @@ def plain(seed):
     return casino.log
 
 
-@DRIVERS
-@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
+@EVERY_DRIVER
+@EVERY_VIEW
+def test_environments_draw_as_plain_runs_do_whatever_else_draws(view):
     logs = {seed: plain(seed) for seed in (7, 8)}
-    envs = {
-        seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver)
-        for seed in logs
-    }
+    envs = {seed: view(Casino, {BET: define(agent="player_0")}, global_rng=True) for seed in logs}
 
     def assert_untouched(move, *args, **kwargs):
         before = world()
@@ -94,7 +91,7 @@ def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
         for _ in range(6):
             for env in envs.values():
                 assert_untouched(env.step, RULE)
-        assert {seed: env.unwrapped.simulation.log for seed, env in envs.items()} == logs
+        assert {seed: env.simulation.log for seed, env in envs.items()} == logs
     for env in envs.values():
         assert_untouched(env.reset)
         assert_untouched(env.close)
@@ -102,8 +99,7 @@ def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_without_it_generators_are_everybodys():
-    env = aec_env(Casino, POINTS)
-    env.reset(seed=7)
+    env = begun(aec_env(Casino, POINTS), 7)
     before = world()
     env.step(RULE)
     assert world() != before
@@ -156,18 +152,16 @@ def test_other_bit_generators_of_the_user_stay():
     assert env.simulation.log == plain(7)
 
 
-@DRIVERS
-def test_one_environment_in_the_rule_of_another(driver):
+@EVERY_DRIVER
+def test_one_environment_in_the_rule_of_another():
     """The state of the outer one is in place in its simulation's thread, too."""
 
     class Gambler(Casino):
         def run(self):
-            self.inner = simulate(
-                Casino, points=POINTS, seed=self.seed, global_rng=True, driver=driver
-            )
+            self.inner = simulate(Casino, points=POINTS, seed=self.seed, global_rng=True)
             return super().run()
 
-    outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True, driver=driver)
+    outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True)
     assert outer.inner.log == outer.log == plain(3)
 
 
@@ -187,10 +181,14 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
         return [card, 0]
 
     before = world()
-    env = aec_env(
-        Casino, {BET: define(agent="player_0", observation_space_mapping=observe)}, global_rng=True
+    env = begun(
+        aec_env(
+            Casino,
+            {BET: define(agent="player_0", observation_space_mapping=observe)},
+            global_rng=True,
+        ),
+        7,
     )
-    env.reset(seed=7)
     env.step(RULE)
     assert len(errors) == 2
     other.reset(seed=1)

@@ -5,11 +5,8 @@ import datetime
 import enum
 import functools
 import math
-import os
 import pickle
 import random
-import subprocess
-import sys
 from collections import deque
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -23,7 +20,7 @@ from hypothesis import strategies as st
 from simenv_marl import Streams, reseed_generators
 from simenv_marl.errors import OptionValueError, SimulationError
 from tests.core.test_global_rng import world
-from tests.processes import ROOT
+from tests.processes import python
 
 
 class Slotted:
@@ -215,9 +212,7 @@ def test_named_streams_are_the_same_in_each_process():
     assert len(set(here)) == len(here)
     code = "from tests.core.test_reseeding import *; print(draws(Streams(3), *NAMES))"
     for seed in "12":
-        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": f"{ROOT / 'src'}"}
-        command = [sys.executable, "-c", code]
-        text = subprocess.check_output(command, cwd=ROOT, env=environment, text=True)
+        text = python("-c", code, env={"PYTHONHASHSEED": seed}).stdout
         assert text.strip() == str(here)
 
 

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import single_env
-from simenv_marl.core.values.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
+from simenv_marl.core.values.actions import ILLEGAL, action_check, mask_cast
 from simenv_marl.core.values.spaces import blank, duplicate, observation_cast, same
 from simenv_marl.errors import InvalidActionError, MaskError, ObservationError
 from tests.worlds.models import calling, decision
@@ -160,16 +160,6 @@ def test_same_compares_number_for_number():
             same(one, copy.deepcopy(other)) for other in values
         ]
     assert [same((1, 2), 3), same(3, 4), same("word", "word")] == [False, False, True]
-
-
-def test_blanks_are_zero_clipped_into_their_space():
-    assert_alike(blank(spaces.Discrete(9, start=-4)), np.int64(0))
-    assert_alike(blank(spaces.Box(-3, -2, (1,), np.float64)), np.array([-2.0]))
-    assert_alike(blank(spaces.MultiDiscrete([2, 2], start=[-5, -1])), np.array([-4, 0]))
-    assert_alike(
-        blank(TREE),
-        {"box": np.float32([0, 0]), "pair": (np.int64(5), {"bits": np.int8([0, 0, 0])})},
-    )
 
 
 def test_the_blank_of_a_space_without_a_zero_is_always_the_same():
@@ -403,15 +393,3 @@ def test_invalid_masks_are_refused(given, match):
 def test_masks_of_several_numbers_have_a_part_for_each(given):
     with pytest.raises(MaskError, match="2 parts"):
         mask_cast(DIALS)(given)
-
-
-def test_a_mask_allows_its_actions_and_an_open_one_allows_all():
-    mask = mask_cast(DIAL)([0, 1, 0])
-    assert [mask_allows(DIAL, mask, action) for action in (5, 6, 7)] == [False, True, False]
-    masks, pairs = (
-        mask_cast(DIALS)([[1, 0], [0, 0, 1]]),
-        [(one, other) for one in (0, 1) for other in (4, 5, 6)],
-    )
-    assert [pair for pair in pairs if mask_allows(DIALS, masks, np.array(pair))] == [(0, 6)]
-    assert_alike(open_mask(DIAL), np.int8([1, 1, 1]))
-    assert [pair for pair in pairs if mask_allows(DIALS, open_mask(DIALS), np.array(pair))] == pairs

@@ -8,13 +8,12 @@ from contextlib import nullcontext
 
 import pytest
 
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, single_env
 from simenv_marl.core.switching import threads
 from simenv_marl.errors import ReentrancyError
 from tests.worlds import farms
+from tests.worlds.marks import EVERY_VIEW
 from tests.worlds.models import calling, decision, notes, script, step
-
-VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
 
 def in_a_thread(function, *args):
@@ -68,7 +67,7 @@ def test_a_simulation_has_one_thread_and_mappings_run_in_the_users(place, older_
 # -- from any thread ------------------------------------------------------------------------------
 
 
-@VIEWS
+@EVERY_VIEW
 def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_threads):
     decide = decision(agent="a_0")
     env = view(calling(*[decide] * 3), decide, driver="thread")
@@ -92,7 +91,7 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_thre
     assert len(simulation_threads()) == len(older_threads) + 1
 
 
-@VIEWS
+@EVERY_VIEW
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
 @pytest.mark.parametrize("place", ["rule", "observation", "render"])
 def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, place):

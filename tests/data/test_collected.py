@@ -269,7 +269,7 @@ def test_extras_that_do_not_fit_are_refused(second, match):
         )
 
 
-def test_agents_that_never_decide_have_arrays_without_rows_and_the_spaces_of_their_point():
+def test_agents_that_never_decide_have_empty_arrays_and_their_spaces():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
     source = script(lambda simulation: bee() if simulation.seed % 2 else None)
     found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 from functools import partial
 
 import cloudpickle
@@ -15,7 +13,7 @@ from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, si
 from simenv_marl.envs import SimulationAECEnv
 from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
-from tests.processes import ROOT
+from tests.processes import python
 from tests.worlds.copied import Walk, WalkEnv, blow, define
 
 VIEWS = {
@@ -146,15 +144,6 @@ class Model:
 """
 
 
-def run(code, given=None):
-    """What a process of its own prints that runs some code."""
-    ran = subprocess.run(
-        [sys.executable, "-c", code], input=given, capture_output=True, timeout=120, cwd=ROOT
-    )
-    assert ran.returncode == 0, ran.stderr.decode()
-    return ran.stdout
-
-
 def test_cloudpickle_takes_a_model_of_the_main_module_to_another_process():
     """A model in ``__main__``, with and without decorators, with lambdas, as in a notebook."""
     code = """
@@ -165,11 +154,12 @@ env.reset()
 env.close()
 sys.stdout.buffer.write(cloudpickle.dumps(env))
 """
-    pickled = run(MODEL + code)
+    pickled = python("-c", MODEL + code, text=False).stdout
     code = """
 import sys, pickle
 from tests.worlds.models import play
 env = pickle.loads(sys.stdin.buffer.read())
 print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.simulation.two())
 """
-    assert run(code, pickled).decode().strip() == "[0.0, 7.0, 7.0, 7.0] 21 10"
+    ran = python("-c", code, text=False, input=pickled)
+    assert ran.stdout.strip() == b"[0.0, 7.0, 7.0, 7.0] 21 10"

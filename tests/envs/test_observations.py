@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 from simenv_marl import aec_env, branch, clone, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core.values.spaces import same
-from tests.worlds.models import Timed, decision, define
+from tests.worlds.models import Timed, begun, decision, define
 
 PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 TREE = spaces.Dict({"pair": PAIR, "row": spaces.Sequence(PAIR)})
@@ -15,14 +15,14 @@ TREE = spaces.Dict({"pair": PAIR, "row": spaces.Sequence(PAIR)})
 class Farm:
     """Two fields that are watered in turn; what grows is seen."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.fields = [Field(), Field()]
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         for field in self.fields:
             field.height = 100.0
 
-    def run(self) -> None:
+    def run(self):
         for _ in range(4):
             for field, water in zip(self.fields, (Field.water, Field.water_more), strict=True):
                 field.height += water(field)
@@ -31,10 +31,10 @@ class Farm:
 class Field:
     height = 0.0
 
-    def water(self) -> int:
+    def water(self):
         return 1
 
-    def water_more(self) -> int:
+    def water_more(self):
         return 2
 
 
@@ -84,7 +84,7 @@ def look(env, told):
 @pytest.mark.parametrize("view", ["single", "parallel", "joint", "aec"])
 @pytest.mark.parametrize("method", ["fork", "replay"])
 @pytest.mark.parametrize("tree", [False, True])
-def test_changed_observations_reach_no_clone_and_no_state(view, method, tree) -> None:
+def test_changed_observations_reach_no_clone_and_no_state(view, method, tree):
     make, action = VIEWS[view]
     options = {"points": points(tree)}
     if not tree:
@@ -112,7 +112,7 @@ def test_changed_observations_reach_no_clone_and_no_state(view, method, tree) ->
     copied.close()
 
 
-def test_a_planner_that_changes_its_observation_can_branch() -> None:
+def test_a_planner_that_changes_its_observation_can_branch():
     def grow(env, number):
         return float(env.step(1)[0][0])
 
@@ -124,7 +124,7 @@ def test_a_planner_that_changes_its_observation_can_branch() -> None:
     assert [field.height for field in farm.fields] == [104.0, 108.0]
 
 
-def test_an_observation_that_stays_is_another_object_each_time() -> None:
+def test_an_observation_that_stays_is_another_object_each_time():
     class Herd:
         def reset(self, seed=None):
             self.field = Field()
@@ -136,8 +136,7 @@ def test_an_observation_that_stays_is_another_object_each_time() -> None:
                 Farm.keeper.water_more()
 
     Farm.keeper = Field()
-    env = parallel_env(Herd, points(False))
-    env.reset(seed=1)
+    env = begun(parallel_env(Herd, points(False)), 1)
     observations, *_ = env.step({"a": 1})
     for _ in range(2):
         before = observations["a"]
@@ -147,23 +146,25 @@ def test_an_observation_that_stays_is_another_object_each_time() -> None:
         assert same(observations["a"], expected)
 
 
-def test_a_policy_that_changes_its_observation_changes_nothing_else() -> None:
+def test_a_policy_that_changes_its_observation_changes_nothing_else():
     def halve(observation):
         observation /= 2
         return 1
 
     states = []
     for policy in (halve, lambda observation: 1):
-        env = single_env(
-            Farm, points(False), agent="b", policies={"a": policy}, state_space="observations"
+        env = begun(
+            single_env(
+                Farm, points(False), agent="b", policies={"a": policy}, state_space="observations"
+            ),
+            1,
         )
-        env.reset(seed=1)
         states.append(env.state().tolist())
     assert states[0] == states[1]
 
 
 @pytest.mark.parametrize("make", [parallel_env, single_env, joint_env])
-def test_elapsed_times_count_from_the_last_decision_that_was_asked(make) -> None:
+def test_elapsed_times_count_from_the_last_decision_that_was_asked(make):
     masks = [[1, 1], [1, 0], [0, 1], [1, 1], [1, 1], [1, 1]]
     decide = decision(
         agent="a",
@@ -175,8 +176,7 @@ def test_elapsed_times_count_from_the_last_decision_that_was_asked(make) -> None
         for _ in range(5):
             simulation.log.append(decide())
 
-    env = make(lambda: Timed(main), decide, skip_forced=True, discount_rate=0.1)
-    env.reset(seed=1)
+    env = begun(make(lambda: Timed(main), decide, skip_forced=True, discount_rate=0.1), 1)
     action = 1 if make is single_env else {"a": 1}
     info = env.step(action)[-1]
     info = info.get("a", info)

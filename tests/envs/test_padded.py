@@ -1,7 +1,5 @@
 """Padded rosters: every possible agent is present, from the reset to the end of the episode."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import random
@@ -22,13 +20,13 @@ from tests.worlds.many_worlds import (
     Announcing,
     Answered,
     Colony,
-    answer,
     beings,
     colony_points,
     designs,
+    played,
     seeds,
 )
-from tests.worlds.models import decision, script
+from tests.worlds.models import begun, decision, script
 
 EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
 
@@ -46,36 +44,26 @@ def is_blank(env, agent, observation):
 @settings(deadline=None)
 @given(EVERYBODY)
 def test_padded_aec_selects_live_agents_only(world):
-    design, seed, kind = world
-    env = colony(design, kind, aec_env, padded=True)
-    env.reset(seed=seed)
-    everybody = list(env.possible_agents)
-    paid, booked, decided = dict.fromkeys(everybody, 0.0), dict.fromkeys(everybody, 0.0), []
-    for agent in env.agent_iter():
-        _, reward, terminated, truncated, info = env.last()
-        paid[agent] += reward
-        assert {tuple(info) for info in env.infos.values()} == {("present",)}
-        if terminated or truncated:
-            assert (terminated, truncated) == (not design.truncates, design.truncates)
-            env.step(None)
-            continue
-        assert sorted(env.agents) == sorted(everybody)
-        assert info["present"] is True
+    def look(agent):
+        assert sorted(env.agents) == everybody
+        assert env.infos[agent] == {"present": True}
         for other in everybody:
             assert not env.terminations[other]
             assert not env.truncations[other]
+            assert set(env.infos[other]) == {"present"}
             assert env.infos[other]["present"] or is_blank(env, other, env.observe(other))
-        env.step(answer(seed, agent, decided.count(agent)))
-        decided.append(agent)
-        for other, value in env.rewards.items():
-            booked[other] += value
-    assert env.possible_agents == everybody
+
+    design, seed, kind = world
+    env = colony(design, kind, aec_env, padded=True)
+    everybody = sorted(env.possible_agents)
+    decided, totals, ends = played(env, seed, look)
+    assert sorted(env.possible_agents) == everybody
     assert env.agents == []
     plain = Answered(design, seed)
     assert decided == plain.decisions
     assert env.simulation.trace == plain.trace
-    assert paid == dict.fromkeys(everybody, 0.0) | plain.totals
-    assert booked == paid  # each reward stands in ``rewards`` once, after the step that brings it
+    assert totals == dict.fromkeys(everybody, 0.0) | plain.totals
+    assert ends == dict.fromkeys(everybody, (not design.truncates, design.truncates))
 
 
 @settings(deadline=None)
@@ -126,14 +114,10 @@ GENERATIONS = life("1 acts, 1 health 7, 1 leaves, 2 health 1, 2 acts, 2 acts")
 
 
 def test_padded_removed_agents_get_their_reward_then_blanks():
-    env = pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES))
-    observations, infos = env.reset(seed=0)
-    assert observations["being_1"].tolist() == [1, 0]
-    assert [infos[agent]["present"] for agent in env.agents] == [True, False]
-    observations, rewards, terminations, _, infos = env.step({"being_1": 3, "being_2": 4})
+    env = begun(pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES)))
+    observations, rewards, *_, infos = env.step({"being_1": 3, "being_2": 4})
     assert env.simulation.log == [3]  # the other one was not there yet when it was given
     assert rewards == {"being_1": 7.0, "being_2": 0.0}
-    assert terminations == {"being_1": False, "being_2": False}
     assert observations["being_1"].tolist() == [0, 0]
     assert infos["being_1"] == {"present": False, "deciding": False, "acted": True}
     assert infos["being_2"] == {"present": True, "deciding": True, "acted": False}
@@ -142,18 +126,12 @@ def test_padded_removed_agents_get_their_reward_then_blanks():
     assert infos["being_1"]["acted"] is False
     with pytest.raises(UnknownAgentError, match="not a live agent"):
         env.step({"being_3": 1})
-    _, rewards, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 5})
-    assert env.simulation.log == [3, 4, 5]
-    assert terminations == {"being_1": True, "being_2": True}
-    assert truncations == {"being_1": False, "being_2": False}
-    assert env.agents == []
 
 
 @pytest.mark.parametrize("steps", [1, 2])
 @pytest.mark.parametrize(("view", "action"), VIEWS)
 def test_a_limit_of_time_truncates_all_alike(steps, view, action):
-    env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, max_steps=steps))
-    env.reset(seed=0)
+    env = begun(pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, max_steps=steps)), 0)
     for _ in range(steps):
         results = env.step(action)
     terminations, truncations = results[2:4] if results else (env.terminations, env.truncations)
@@ -199,8 +177,7 @@ def test_masks_are_open_and_clocks_go_on():
 
 def test_after_an_error_nobody_is_there_before_a_reset():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
-    env = pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES))
-    env.reset(seed=0)
+    env = begun(pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES)), 0)
     with pytest.raises(ZeroDivisionError):
         env.step(1)
     assert env.agents == []
@@ -219,8 +196,10 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)
 def test_a_padded_state_has_blanks_and_a_padded_copy_needs_a_reset(view, action):
-    env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations"))
-    env.reset(seed=0)
+    env = begun(
+        pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations")),
+        0,
+    )
     assert env.state()[:2].tolist() == [1, 0]
     env.step(action)
     assert env.state()[:2].tolist() == [0, 0]

@@ -1,19 +1,13 @@
 """Simulations in several processes give the results of one process, and leave nothing behind."""
 
-from __future__ import annotations
-
 import gc
 import multiprocessing
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,14 +17,15 @@ from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
 from tests.conftest import DRIVERS
 from tests.envs.test_vector import begun
-from tests.processes import ROOT, alone, descriptors, gone
+from tests.processes import alone, descriptors, gone, python
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 from tests.worlds.models import notes
+from tests.worlds.undone import fails
 
 pytestmark = FORKS
 
 
-def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
+def workers(model=Counter, decision=None, **options):
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
     return vector_env(model, {POINT: decision or definition()}, **options)
 
@@ -46,10 +41,10 @@ def _nothing_is_left():
 class Failing(Counter):
     """Counts for ever; calls its reset's option for its seed after decisions and in unwinding."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.process = os.getpid()
 
-    def run(self) -> Any:
+    def run(self):
         try:
             while True:
                 self.count += self.decide()
@@ -57,7 +52,7 @@ class Failing(Counter):
         finally:
             self.call("unwinding")
 
-    def call(self, when: str) -> None:
+    def call(self, when):
         happens = (self.options or {}).get(when, {})
         if self.seed in happens:
             happens[self.seed]()
@@ -67,7 +62,7 @@ ONES = np.ones(4, np.int64)
 KILLED = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 
 
-def goes_on(envs: Any, seed: int = 0) -> None:
+def goes_on(envs, seed=0):
     envs.reset(seed=seed)
     assert [simulation.seed for simulation in envs.get_attr("simulation")] == [
         seed + place for place in range(4)
@@ -89,7 +84,7 @@ def test_async_vector_env_of_single_views_returns_the_same(kind, context, mode):
     theirs.close()
 
 
-def processes_of(envs: Any) -> list[int]:
+def processes_of(envs):
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
@@ -128,10 +123,8 @@ def test_an_error_says_of_which_simulation_and_the_next_reset_works():
         ),
     )
     envs.reset(seed=0, options={"poor": 2})
-    with pytest.raises(RewardError, match="not finite") as caught:
+    with fails(RewardError, "sub-environment 2", "seed 2", match="not finite"):
         envs.step(ONES)
-    assert "sub-environment 2" in notes(caught.value)
-    assert "seed 2" in notes(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
     with pytest.raises(EpisodeOverError, match="without a reset_mask"):
@@ -206,7 +199,7 @@ def test_a_second_close_ends_workers_that_an_interrupted_one_has_left(monkeypatc
 
 
 def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
-    def finish(path: Path) -> None:
+    def finish(path):
         time.sleep(0.3)
         path.touch()
 
@@ -235,10 +228,10 @@ def test_an_environment_closes_although_a_simulation_hangs(monkeypatch):
 def test_an_interrupted_step_leaves_the_workers_usable():
     home = os.getpid()
 
-    def interrupt(*_: Any) -> None:
+    def interrupt(*_):
         raise KeyboardInterrupt
 
-    def alarm() -> None:
+    def alarm():
         time.sleep(0.1)
         os.kill(home, signal.SIGALRM)
         time.sleep(0.3)
@@ -276,26 +269,20 @@ if __name__ == "__main__":
 """
 
 
-def run_script(path: Path, text: str, *options: str) -> Any:
-    path.write_text(text, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-    # The output ends when the last worker does.
-    command = [sys.executable, *options, str(path)]
-    return subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-
-
 @pytest.mark.parametrize("context", ["spawn", FORK])
-@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "os.kill(os.getpid(), 9)"])
-def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [("", 0), ("raise KeyboardInterrupt", -2), ("os.kill(os.getpid(), 9)", -9)],
+)
+def test_nothing_stays_behind_when_the_interpreter_ends(context, end, status, tmp_path):
     strict = ["-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev"]
-    done = run_script(tmp_path / "script.py", SCRIPT.format(context=context, end=end), *strict)
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
+    # The output ends when the last worker does.
+    done = python(*strict, path, status=status)
     assert done.stdout.splitlines()[0] == "[1.0, 2.0]"
     assert done.stdout.count("unwound") == 2
-    if not end:
-        assert done.stderr == ""
-        assert done.returncode == 0
+    assert end or done.stderr == ""
     assert "leaked" not in done.stderr
 
 
@@ -323,7 +310,7 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
     alone(start_in_vain, error)
 
 
-def start_in_vain(error: str) -> None:
+def start_in_vain(error):
     context, home = multiprocessing.get_context(FORK), os.getpid()
     start, started = context.Process.start, []
 
@@ -352,6 +339,7 @@ def start_in_vain(error: str) -> None:
 
 def test_a_script_without_a_main_guard_raises_an_error_that_names_it(tmp_path):
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
-    last = run_script(tmp_path / "script.py", text).stderr.strip().splitlines()[-1]
+    (tmp_path / "script.py").write_text(text, encoding="utf-8")
+    last = python(tmp_path / "script.py", status=1).stderr.strip().splitlines()[-1]
     assert last.startswith("simenv_marl.errors.WorkerError: ")
     assert 'if __name__ == "__main__":' in last

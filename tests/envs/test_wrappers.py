@@ -3,8 +3,6 @@
 Some need packages that only ``make test-wrappers`` installs.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any, NamedTuple
 
@@ -25,11 +23,11 @@ class Case(NamedTuple):
     render_mode: str | None = None
 
 
-def drawn(*needs: str, **arguments: Any) -> Case:
+def drawn(*needs, **arguments):
     return Case(arguments, needs=needs, render_mode="rgb_array")
 
 
-def halved(value: Any) -> Any:
+def halved(value):
     return value / 2
 
 
@@ -80,7 +78,7 @@ def test_wrappers_work_as_around_an_environment_written_by_hand(name, case, tmp_
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     packages = {package: pytest.importorskip(package) for package in case.needs}
 
-    def told_by(make: Any) -> list[Any]:
+    def told_by(make):
         env = wrappers.TimeLimit(make(case.seen, render_mode=case.render_mode), 9)
         special = packages | {"numpy": np, "a folder": str(tmp_path / type(env.unwrapped).__name__)}
         arguments = {

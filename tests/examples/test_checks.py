@@ -45,7 +45,7 @@ def test_gymnasium_accepts_a_herd_as_one_agent():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_check_of_the_library_finds_nothing_in_an_example_whose_environments_pickle(name):
+def test_the_check_finds_nothing_in_an_example_whose_environments_pickle(name):
     simulation, points = EXAMPLES[name]
     env = aec_env(simulation, points)
     copied = pickle.loads(pickle.dumps(env))

@@ -28,9 +28,7 @@ def test_no_cent_is_lost_by_random_legal_actions():
 
 
 @pytest.mark.parametrize(("coverage", "ends"), [(0.02, [True, False]), (1.5, [False, True])])
-def test_an_episode_is_terminated_when_pensions_cannot_be_paid_and_truncated_at_its_last_year(
-    coverage, ends
-):
+def test_an_episode_ends_with_unpaid_pensions_or_with_its_last_year(coverage, ends):
     manager = {
         point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"
     }

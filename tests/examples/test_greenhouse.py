@@ -38,7 +38,7 @@ def test_pettingzoo_accepts_the_greenhouse():
     parallel_api_test(parallel_env(), num_cycles=100)
 
 
-def test_an_episode_terminates_when_all_plants_are_dead_and_is_truncated_after_a_hundred_days():
+def test_an_episode_ends_with_the_last_plant_or_after_a_hundred_days():
     environment = raw_env()
     dead = play(environment, seed=1)
     assert [turn[3:5] for turn in dead[-2:]] == [(True, False)] * 2

@@ -52,8 +52,8 @@ env.reset()
 while not env.step(RULE)[2]:
     pass
 state = lambda simulation: [(p.health, p.water) for p in simulation.greenhouse.pots]
-assert state(plain) == state(env.unwrapped.simulation)
-assert plain.day == env.unwrapped.simulation.day
+assert state(plain) == state(env.simulation)
+assert plain.day == env.simulation.day
 for points in (["model.Greenhouse.choose_water_amount"], []):
     assert aec_env(GreenhouseSim, *points).possible_agents == ["choosewateramount_0"]
 """

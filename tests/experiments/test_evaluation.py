@@ -1,6 +1,5 @@
 """Contenders on the same seeds."""
 
-import subprocess
 import sys
 import threading
 from collections import Counter
@@ -20,10 +19,12 @@ from simenv_marl.decision import decision_points
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
-from tests.conftest import DRIVERS
+from tests.processes import run_code
 from tests.worlds.many_worlds import Colony, Design, colony_points
-from tests.worlds.models import notes, play
+from tests.worlds.marks import EVERY_DRIVER
+from tests.worlds.models import play
 from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some
+from tests.worlds.undone import fails
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -73,7 +74,7 @@ def by_number(observation):
 
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
-@pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
+@EVERY_DRIVER
 @pytest.mark.parametrize("options", [{}, {"max_steps": 5}], ids=str)
 @pytest.mark.parametrize("batched", [False, True])
 def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched, options):
@@ -264,7 +265,7 @@ def test_the_number_of_seeds_is_that_of_the_paired_t_test(size, power, confidenc
     assert found.seeds_needed(size * apart.std(ddof=1), power=power)["b"] == np.ceil(expected)
 
 
-def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_wrong_ones_are_refused():  # noqa: E501
+def test_seeds_needed_are_bounded_and_wrong_differences_are_refused():
     returns = of_teams(a=[0, 0, 0], b=[1, 2, 3], same=[0, 0, 0])
     found = Evaluation(returns, "a", 0.95)
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):
@@ -329,7 +330,7 @@ def test_the_team_is_what_its_user_makes_of_the_returns():
     ids=["team", "policy"],
 )
 def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, given, arguments):
-    with pytest.raises(KeyError, match=match) as caught:
+    with fails(KeyError, "seed 0", f"of the contender '{contender}'", match=match):
         evaluate(
             Shop,
             {"rule": {}, "bad": {"keeper": keeper}},
@@ -338,8 +339,6 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
             **given,
             **arguments,
         )
-    assert "seed 0" in notes(caught.value)
-    assert f"of the contender '{contender}'" in notes(caught.value)
 
 
 def test_a_variant_brings_its_own_points_and_policies():
@@ -457,9 +456,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
 
 def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_need():
     names = {"pandas", "scipy.stats", "pydoe", "SALib", "simenv_marl.testing"}
-    code = f"import sys, simenv_marl; print({names} & sys.modules.keys())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    assert run_code(f"import sys, simenv_marl; print({names} & sys.modules.keys())") == "set()\n"
 
 
 def test_two_points_of_the_same_agent_have_one_row(monkeypatch):

@@ -403,7 +403,7 @@ def test_another_version_of_a_package_is_warned_of(tmp_path):
 
 
 @pytest.mark.parametrize(("batched", "cut"), [(False, 1), (True, 20), (True, 700)])
-def test_a_full_disk_is_an_error_stored_runs_stay_and_the_one_whose_line_is_torn_is_run_again(
+def test_a_full_disk_is_an_error_and_only_the_torn_run_is_run_again(
     batched, cut, tmp_path, monkeypatch
 ):
     def open_full(path, *args, **kwargs):
@@ -552,7 +552,7 @@ def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_
     assert run(tmp_path / "a", make=Deadly, workers=2, **given).equals(frame)
 
 
-def test_a_backend_that_does_not_tell_of_the_death_of_its_workers_is_refused_before_anything_runs(
+def test_a_backend_that_hides_the_death_of_workers_is_refused_at_once(
     tmp_path,
 ):
     with joblib.parallel_config(backend="multiprocessing"):

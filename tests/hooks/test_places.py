@@ -29,7 +29,7 @@ from simenv_marl.plugins import (
 )
 from tests.foreign import market, shop
 from tests.hooks.forms import FORMS, MARKET
-from tests.worlds.models import calling, define, play
+from tests.worlds.models import begun, calling, define, play
 
 PRICE, LOOK = f"{MARKET}.price", f"{__name__}._Hiding.look"
 
@@ -208,11 +208,12 @@ def test_models_of_points_and_of_targets_are_collected_with_these():
         references.append(weakref.ref(Model))
         name = hook_of(Model.decorated).name
         assert name in registered()
-        env = aec_env(
-            calling(lambda model=Model: model().decide()),
-            {Model.decide: define(), Model.decorated: None},
+        env = begun(
+            aec_env(
+                calling(lambda model=Model: model().decide()),
+                {Model.decide: define(), Model.decorated: None},
+            )
         )
-        env.reset()
         env.close()
         with handlers(
             (lambda model, _result: ChangedResult(_result + 1), Model.__iter__, "after_next")
@@ -249,8 +250,7 @@ def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, e
     owner, attribute = resolve(name)
     before, points = vars(owner).get(attribute), {name: define(agent="one_0")}
     for _ in range(3):
-        env = aec_env(calling(call), points)
-        env.reset()
+        env = begun(aec_env(calling(call), points))
         hook = find_hook(name)
         with mock.patch.object(owner, attribute, return_value="mocked"):
             if end == "close":
@@ -263,6 +263,6 @@ def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, e
         assert call() == expected
         env = aec_env(calling(call, call), points)
         play(env, iter([1, 2]))
-        assert env.unwrapped.simulation.log == [1, 2]
+        assert env.simulation.log == [1, 2]
         env.close()
         assert vars(owner).get(attribute) is before

@@ -28,7 +28,7 @@ from simenv_marl.plugins import handlers
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import calling, decision, decisions, define, plainly, play, script
+from tests.worlds.models import begun, calling, decision, decisions, define, plainly, play, script
 from tests.worlds.undone import left_as_they_were
 
 # Traders and brokers decide under one name here: it is about functions, and not about agents.
@@ -45,7 +45,7 @@ def _nothing_stays_patched():
 def log_of(env, action=9):
     """What the simulation gets to see when one action answers everything."""
     play(env, action)
-    return env.unwrapped.simulation.log
+    return env.simulation.log
 
 
 # -- forms ----------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def test_points_may_be_named_in_all_forms(points, agents):
     order = ["heat_0", "cool_0", "cooler_0", "air_0", "fan_0", "light_0"]
     assert env.possible_agents == agents
     assert decisions(play(env, 1)) == sorted(agents, key=order.index)
-    assert env.unwrapped.simulation.log.count(1) == len(agents)  # what is not named runs its rule
+    assert env.simulation.log.count(1) == len(agents)  # what is not named runs its rule
 
 
 @pytest.mark.parametrize(
@@ -188,12 +188,11 @@ def test_points_that_cannot_be_decided_are_refused_at_construction(points, error
 @pytest.mark.parametrize("how", ["by name", "as itself"])
 @pytest.mark.parametrize(("name", "call", "rule"), FORMS.values(), ids=FORMS)
 def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
-    env = aec_env(calling(call, call), {found(name, how): define()})
-    env.reset()
+    env = begun(aec_env(calling(call, call), {found(name, how): define()}))
     assert call() == rule  # for everybody else
     env.step(9)
     env.step(RULE)
-    assert env.unwrapped.simulation.log == [9, rule]
+    assert env.simulation.log == [9, rule]
     assert call() == rule
 
 
@@ -230,9 +229,7 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
             assert log_of(env) == ([5, 9, 9, 5, 4] if named is SUB else [9, 9, 9, 9, 8])
             # RULE for the broker runs what it has inherited, which may be a decision of its own.
             play(env, {"broker_0": RULE, "trader_0": 7})
-            assert env.unwrapped.simulation.log == (
-                [5, 5, 5, 5, 4] if named is SUB else [7, 7, 7, 7, 6]
-            )
+            assert env.simulation.log == ([5, 5, 5, 5, 4] if named is SUB else [7, 7, 7, 7, 6])
         for env in envs:
             env.close()
         assert bids() == [5, 5, 5, 5, 4]
@@ -264,16 +261,17 @@ def test_patches_last_until_the_last_environment_is_gone(name, end):
 def test_modules_that_are_imported_between_reset_and_step_decide_and_are_restored(monkeypatch):
     before, late = market.price, types.ModuleType("late_shop")
     monkeypatch.setitem(sys.modules, "late_shop", late)
-    env = aec_env(
-        calling(lambda: market.price("tea"), lambda: late.asked("tea")),
-        {f"{MARKET}.price": define()},
+    env = begun(
+        aec_env(
+            calling(lambda: market.price("tea"), lambda: late.asked("tea")),
+            {f"{MARKET}.price": define()},
+        )
     )
-    env.reset()
     exec("from tests.foreign.market import price as asked", vars(late))
     assert late.asked("tea") == 10
     env.step(3)
     env.step(4)
-    assert env.unwrapped.simulation.log == [3, 4]
+    assert env.simulation.log == [3, 4]
     env.close()
     assert before is late.asked is market.price is shop.price is shop.cost
 
@@ -297,7 +295,7 @@ def test_one_function_under_many_names_is_one_point(first):
 # -- environments of the same undecorated model ---------------------------------------------------
 
 
-def test_environments_of_the_same_undecorated_model_have_their_own_points_and_definitions():
+def test_environments_of_one_undecorated_model_have_their_own_definitions():
     other = decision()
     traders = calling(lambda: Trader().bid("tea"), other)
     one = aec_env(traders, {BID: define(action_space_mapping=lambda action: ("one", action))})
@@ -310,12 +308,12 @@ def test_environments_of_the_same_undecorated_model_have_their_own_points_and_de
     assert log_of(aec_env(traders, other)) == [5, 9]
     one.step(1)
     two.step(2)
-    assert one.unwrapped.simulation.log == [("one", 1), "rule"]
-    assert two.unwrapped.simulation.log == [("two", 2), "rule"]
+    assert one.simulation.log == [("one", 1), "rule"]
+    assert two.simulation.log == [("two", 2), "rule"]
     assert (one.possible_agents, two.possible_agents) == (["bid_0"], ["b_0"])
 
 
-def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_decorated():
+def test_local_classes_are_found_and_local_functions_must_be_decorated():
     class Local:
         def decide(self):
             return "rule"
@@ -332,7 +330,7 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
         aec_env(calling(decide), {decide: define()})
 
 
-def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(
+def test_threads_that_register_and_extend_functions_leave_each_other_alone(
     monkeypatch,
 ):
     def dawdle(hook, *args):
@@ -411,20 +409,16 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
 def test_dicts_from_functions_work_while_environments_live():
     """The class then has a wrapper, which is another key of the same point."""
     points = {Trader.bid: define(agent="old")}
-    env = aec_env(calling(lambda: Trader().bid("tea")), points)
-    env.reset()
+    env = begun(aec_env(calling(lambda: Trader().bid("tea")), points))
     assert Trader.bid not in points
     changed = points | {Trader.bid: define(agent="new")}
     for given, agent in [(points, "old"), (changed, "new"), (changed, "new")]:
-        other = aec_env(calling(lambda: Trader().bid("tea")), given)
-        other.reset()
+        other = begun(aec_env(calling(lambda: Trader().bid("tea")), given))
         assert other.agents == [agent]
         env.close()
-    assert simulate(env.unwrapped.simulation, {Trader.bid: lambda _: 4}, points=changed).log == [4]
+    assert simulate(env.simulation, {Trader.bid: lambda _: 4}, points=changed).log == [4]
     with pytest.raises(UnknownPointError, match="was named twice"):
         aec_env(calling(Trader), {BID: define(), Trader.bid: define()})
-    with pytest.raises(UnknownPointError, match="was named twice"):
-        aec_env(calling(Trader), [Home.heat, Home.heat])
 
 
 # -- quick rewards --------------------------------------------------------------------------------
@@ -435,8 +429,7 @@ def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkey
     monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", others)
     rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
     decide = decision(reward_mapping=lambda: next(rewards))
-    env = single_env(calling(*[decide] * 4), decide)
-    env.reset()
+    env = begun(single_env(calling(*[decide] * 4), decide))
     assert [repr(env.step(1)[1]) for _ in range(2)] == ["2.0", "0.5"]
     with pytest.raises(RewardError, match="not one number"):
         env.step(1)

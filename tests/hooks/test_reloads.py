@@ -60,7 +60,7 @@ def points_of(model, *names):
 
 def log_of(env):
     play(env, 3)
-    return env.unwrapped.simulation.log
+    return env.simulation.log
 
 
 def test_a_new_environment_decides_in_the_new_functions(model):

@@ -19,10 +19,11 @@ from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.contract.test_simulate_many import ones
-from tests.processes import ROOT, alone, descriptors
+from tests.processes import ROOT, alone, descriptors, python
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.models import calling, decision, define, notes, script
+from tests.worlds.models import calling, decision, define, script
+from tests.worlds.undone import fails
 
 # Where work is given up, joblib empties its queue of work while a thread of its own may be about to
 # take from it, and ends that thread in any case.
@@ -169,7 +170,7 @@ def test_errors_surface_as_themselves():
         (raising, LocalError, "^a", "seed"),
         (lambda observations: [1], InvalidActionError, "decisions", "seed"),
     ):
-        with pytest.raises(error, match=match) as caught:
+        with fails(error, told, match=match) as caught:
             simulate_many(
                 script(main),
                 {ant: policy},
@@ -177,7 +178,6 @@ def test_errors_surface_as_themselves():
                 workers=2,
                 collect=lambda simulation: None,
             )
-        assert told in notes(caught.value)
         # where it was raised there
         assert error is not ZeroDivisionError or "in main" in str(caught.value.__cause__)
 
@@ -235,10 +235,7 @@ def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, mo
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*filter(None, sys.path), str(ROOT)]))
     path, begun = tmp_path / "script.py", tmp_path / "begun"
     path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, path], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.stdout.splitlines() == ["[0, 8, 11]"] * 3, done.stderr
+    assert python(path).stdout.splitlines() == ["[0, 8, 11]"] * 3
     command = [sys.executable, path, begun]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -301,7 +298,7 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
     alone(work_in_vain, what)
 
 
-def work_in_vain(what: str) -> None:
+def work_in_vain(what):
     loky, home = joblib.externals.loky, os.getpid()
 
     def refuse(process):
@@ -402,10 +399,6 @@ def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
     """They are pickled by value with lambdas, and else found in the imported script."""
     path = tmp_path / "script.py"
     path.write_text(MAIN_SCRIPT.format(definition=definition), encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}
-    done = subprocess.run(
-        [sys.executable, path], env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
     tank, chosen, yard = [f"[[{log}], [{log}]]" for log in ("(1, 0, 0)", "(0, 1, 0)", "(0, 0, 1)")]
-    assert done.stdout.splitlines() == [tank] * 2 + [chosen] * 4 + [yard] * 2 + [chosen] * 2
+    expected = [tank] * 2 + [chosen] * 4 + [yard] * 2 + [chosen] * 2
+    assert python(path).stdout.splitlines() == expected

@@ -19,7 +19,7 @@ COMPILER = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 
 
-def compiled(source: Path, folder: Path) -> Path:
+def compiled(source, folder):
     """Compile a program that includes the client; return where it lies."""
     program, client = folder / source.stem, HERE.parents[1] / "clients" / "cpp"
     command = [COMPILER, "-std=c++17", "-O1", *WARNINGS, f"-I{client}", source, "-o", program]

@@ -42,17 +42,17 @@ PRICE = make_step(
 BOTH = {"reservoir.inflow": INFLOW, "broker.price": PRICE}
 
 
-def command(*arguments: str) -> list[str]:
+def command(*arguments):
     """What starts the model in a process of its own."""
     return [sys.executable, outside.__file__, *arguments]
 
 
-def reservoirs(points=BOTH, **options) -> ProcessSimulation:
+def reservoirs(points=BOTH, **options):
     """The model in a process of its own."""
     return ProcessSimulation(command(), points, **options)
 
 
-def broken(what: str) -> ProcessSimulation:
+def broken(what):
     """A simulator that does something wrong in mid-episode."""
     return ProcessSimulation([sys.executable, faulty.__file__, what], BOTH, timeout=20.0)
 
@@ -66,14 +66,14 @@ outside.main()
 """
 
 
-def changed(folder: Path, change: str) -> list[str]:
+def changed(folder, change):
     """What starts the model with some change to it or to its end of the wire."""
     script = folder / "changed.py"
     script.write_text(CHANGED.format(folder=str(Path(outside.__file__).parent), change=change))
     return [sys.executable, str(script)]
 
 
-def by_its_rule(seed: int, **options) -> dict:
+def by_its_rule(seed, **options):
     """What comes of the model by its own rule, in this process."""
     return outside.Reservoirs(seed, options).by_its_rule()
 
@@ -84,7 +84,7 @@ def child(env):
     return None if found is None else found.pid
 
 
-def plays_by_its_rule(env, seed=1, **options) -> bool:
+def plays_by_its_rule(env, seed=1, **options):
     """Whether an episode of an AEC environment in which the rule decides is the model's own."""
     env.reset(seed=seed, options=options)
     play(env, reset=False)
@@ -106,7 +106,7 @@ def price(call):
     return call.rule()
 
 
-def removed(call) -> None:
+def removed(call):
     """It is gone."""
 
 
@@ -127,18 +127,18 @@ class Here(SimulationInterface):
         f"{__name__}.price": TELLING["broker.price"],
     }
 
-    def reset(self, seed=None, options=None) -> None:
+    def reset(self, seed=None, options=None):
         self.model = outside.Reservoirs(seed, options or {})
         self.calls = defaultdict(Call)
 
-    def run(self) -> None:
+    def run(self):
         self.model.run(
             self._decide,
             lambda point, entity: removed(self.calls.pop((point, entity))),
             lambda point, entity, arguments: vars(self.calls[point, entity]).update(arguments),
         )
 
-    def time(self) -> float:
+    def time(self):
         return self.model.time
 
     def _decide(self, point, entity, time, arguments, rule):

@@ -1,7 +1,5 @@
 """The clients in C++, Java and Python: programs follow a script, and the test is the other side."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -78,21 +76,21 @@ def child(client):
         yield child
 
 
-def ended(result: Any = None, *, truncated: bool = False) -> dict[str, Any]:
+def ended(result=None, *, truncated=False):
     return {"end": {"truncated": truncated, "result": result}}
 
 
-def plays_well(child: Child) -> bool:
+def plays_well(child):
     """Whether an episode is one like any other."""
     return child.begin(5, play="seed") == ended(5)
 
 
-def has_given_up(child: Child) -> bool:
+def has_given_up(child):
     """Whether the process has ended with an error and said nothing more."""
     return child.receive() is None and child.ended()[0] == 1
 
 
-def plain(client: Client, play: str, **env: str) -> subprocess.CompletedProcess[str]:
+def plain(client, play, **env):
     """Run a model without an environment, or with one that is none."""
     command, text = [*client.command, play], {"encoding": "utf-8", "errors": "replace"}
     return subprocess.run(

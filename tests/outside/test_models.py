@@ -1,7 +1,5 @@
 """Models outside Python: a Java town, an ns-3 network, Enki robots, and the pages on clients."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -9,7 +7,6 @@ import subprocess
 import sys
 from contextlib import closing
 from itertools import islice
-from typing import Any
 
 import pytest
 from examples.enki_robots import env as robots
@@ -28,21 +25,21 @@ from tests.worlds.models import play
 BRIEF = {"seconds": 5.0}
 
 
-def printed(*command: Any) -> str:
+def printed(*command):
     """What a program prints without an environment."""
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
     assert output, "no result"
     return output
 
 
-def plain(example: Any, seed: int, **options: Any) -> Any:
+def plain(example, seed, **options):
     """What a model tells by itself."""
     if example is town:
         return town.plain(seed)["result"]
     return json.loads(printed(example.program(), str(seed), json.dumps(options)))
 
 
-def no_java() -> str:
+def no_java():
     """Why the town cannot be built."""
     try:
         building.java()
@@ -60,7 +57,7 @@ MODELS = {
 """What a model needs and is not there, its example, and episodes."""
 
 
-def needs(name: str) -> pytest.MarkDecorator:
+def needs(name):
     """Skips a test without what a model needs."""
     missing, *_ = MODELS[name]
     return pytest.mark.skipif(bool(missing), reason=missing)
@@ -99,7 +96,7 @@ def test_the_code_of_the_page_runs(capsys):
 PAGE = "clients-outside.md"
 
 
-def shown(language: str) -> list[str]:
+def shown(language):
     """The page's blocks in another language."""
     return re.findall(
         rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text("utf-8"), re.MULTILINE | re.DOTALL
@@ -113,7 +110,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def environment(command: list[str]) -> dict[str, Any]:
+def environment(command):
     """Runs the page's environment with a command, and returns its names."""
     names = {"__name__": "page"}
     shown_code = shown("python")[1]

@@ -51,7 +51,7 @@ from tests.outside.reservoirs import (
 )
 from tests.processes import runs
 from tests.worlds import bare
-from tests.worlds.models import play
+from tests.worlds.models import begun, play
 
 
 def _cheap(observation):
@@ -65,7 +65,7 @@ def test_rule_is_the_plain_run_and_one_process_plays_all_episodes(make_env):
         assert plays_by_its_rule(env, seed)
         numbers.add(child(env))
     plain = subprocess.run(command("2"), capture_output=True, check=True, timeout=60)
-    assert json.loads(plain.stdout) == env.unwrapped.simulation.result
+    assert json.loads(plain.stdout) == env.simulation.result
     env.reset(seed=3)
     env.step(RULE)
     assert plays_by_its_rule(env)  # after an episode that was broken off
@@ -81,7 +81,7 @@ def test_options_arrive_and_a_truncation_is_reported(make_env):
     env.reset(seed=1, options={"hours": 4, "truncated": True})
     *_, last = play(env, reset=False)
     assert (last.terminated, last.truncated) == (False, True)
-    assert env.unwrapped.simulation.result == by_its_rule(1, hours=4)
+    assert env.simulation.result == by_its_rule(1, hours=4)
 
 
 def test_a_process_that_exits_after_its_episodes_is_started_anew(make_env):
@@ -128,7 +128,7 @@ def test_policies_answer_by_agent_and_by_point(make_env):
     not_named = {"broker.price": lambda observation: 2}
     env = make_env(aec_env, reservoirs(), "reservoir.inflow", policies=not_named)
     play(env, seed=1)
-    assert env.unwrapped.simulation.result["price"] == 2.0
+    assert env.simulation.result["price"] == 2.0
 
 
 def test_points_may_be_given_other_definitions_and_apply_answers_with_what_it_returns(make_env):
@@ -137,7 +137,7 @@ def test_points_may_be_given_other_definitions_and_apply_answers_with_what_it_re
     )
     env = make_env(aec_env, reservoirs({**BOTH, "broker.price": INFLOW}), {"broker.price": answer})
     *_, last, _ = play(env, 1, seed=1)
-    assert env.unwrapped.simulation.result["price"] == 1 + last.observation[0]
+    assert env.simulation.result["price"] == 1 + last.observation[0]
     other = make_env(aec_env, reservoirs(), {"reservoir.inflow": INFLOW})
     assert any(turn.terminated for turn in play(other, seed=1))  # here, too, the gone are removed
 
@@ -189,12 +189,12 @@ def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
         aec_env, simulation, name, plugins=[(lambda call: seen.append(call.point), name, "before")]
     )
     play(env, 2, seed=1)
-    assert env.unwrapped.simulation.result == [{"some": [1.5]}] * 6
+    assert env.simulation.result == [{"some": [1.5]}] * 6
     assert seen == [name] * 6
     assert simulate(simulation, {name: lambda observation: 0}, seed=1).result == ["none"] * 6
     assert json.dumps is before
     play(env, seed=2)
-    assert env.unwrapped.simulation.result == [None] * 6
+    assert env.simulation.result == [None] * 6
 
 
 def test_handlers_extend_decisions_by_their_name(make_env):
@@ -212,7 +212,7 @@ def _begun(env, steps):
 
 def _played_out(env, number=0):
     play(env, reset=False)
-    return env.unwrapped.simulation.result
+    return env.simulation.result
 
 
 def test_branches_by_replay_are_exact_and_forks_are_refused(make_env):
@@ -230,8 +230,9 @@ def test_other_futures_are_drawn_in_the_process(make_env):
 
 
 def test_a_process_that_cannot_reseed_says_so():
-    simulation = ProcessSimulation([sys.executable, bare.__file__, "rate"], {"rate": PLAIN})
-    simulation.reset(seed=1)
+    simulation = begun(
+        ProcessSimulation([sys.executable, bare.__file__, "rate"], {"rate": PLAIN}), 1
+    )
     with pytest.raises(BranchError, match='has not announced "reseed"'):
         simulation.reseed(3)
     simulation.close()
@@ -283,8 +284,7 @@ def test_processes_that_are_kept_end_with_what_has_run(started):
 
 
 def test_an_environment_that_is_gone_takes_its_process_along():
-    env = aec_env(reservoirs())
-    env.reset(seed=1)
+    env = begun(aec_env(reservoirs()), 1)
     env.step(RULE)
     number = child(env)
     assert runs(number)
@@ -294,8 +294,7 @@ def test_an_environment_that_is_gone_takes_its_process_along():
 
 
 def test_copies_are_made_of_the_same_and_have_processes_of_their_own(make_env):
-    env = make_env(aec_env, reservoirs())
-    env.reset(seed=1)
+    env = begun(make_env(aec_env, reservoirs()), 1)
     other = aec_env(reservoirs({"broker.price": PRICE}, env=MappingProxyType({**os.environ})))
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(other))):
         assert child(twin) is None
@@ -328,11 +327,15 @@ def test_calls_can_be_copied():
 
 
 def test_what_is_no_json_is_refused_before_anything_is_sent(make_env):
-    env = make_env(
-        aec_env,
-        reservoirs({"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}),
+    env = begun(
+        make_env(
+            aec_env,
+            reservoirs(
+                {"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}
+            ),
+        ),
+        1,
     )
-    env.reset(seed=1)
     number = child(env)
     with pytest.raises(WireError, match="'a'"):
         env.reset(seed=1, options={"a": {3}})

@@ -15,14 +15,14 @@ from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, command, reservoirs
 from tests.processes import runs
 from tests.worlds.counters import alike
-from tests.worlds.models import play
+from tests.worlds.models import begun, play
 
 pytestmark = pytest.mark.greenlet(
     "the rule's decision comes back within the simulation, whatever runs it"
 )
 
 
-def telling(points=TELLING) -> ProcessSimulation:
+def telling(points=TELLING):
     """The reservoirs in a process that tells what its rules decide."""
     return ProcessSimulation(command("tells"), points)
 
@@ -125,16 +125,16 @@ GRAZE = make_step(
 )
 
 
-def line(frame) -> str:
+def line(frame):
     return frame if isinstance(frame, str) else json.dumps(frame)
 
 
-def both(*frames) -> str:
+def both(*frames):
     """Frames that are sent together."""
     return "\n".join(map(line, frames))
 
 
-def speaking(*frames) -> ProcessSimulation:
+def speaking(*frames):
     """A simulator that sends some frames or lines, whatever it receives."""
     return ProcessSimulation(
         [sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE}
@@ -242,8 +242,9 @@ def test_frames_that_were_not_announced_are_errors(frame):
     ids=["one by one", "together", "in mid-episode"],
 )
 def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds):
-    env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *frames, {"end": {}}))
-    env.reset(seed=1)
+    env = begun(
+        make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *frames, {"end": {}})), 1
+    )
     assert len(env.agents) == born
     for _ in range(rounds):
         assert env.agents
@@ -265,7 +266,7 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
     observations, _, terminations, *_ = env.step(dict.fromkeys(env.agents, 3))
     assert observations.keys() == terminations.keys()
     assert terminations == {"a": True, "b": False, "c": False, "d": False}
-    calls = env.unwrapped.simulation.expected_calls("sheep.graze")
+    calls = env.simulation.expected_calls("sheep.graze")
     assert [(call.entity, call.time) for (call,) in calls] == [("c", 0.5), ("d", 0.5)], (
         "one decides now"
     )
@@ -279,15 +280,14 @@ def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_e
     env = make_env(aec_env, speaking(HELLO, *frames), {"sheep.graze": named})
     play(env, seed=1)
     assert [call.entity for call in names] == ["a", "b", "a"]
-    assert env.unwrapped.simulation.expected_calls("sheep.graze") == []
+    assert env.simulation.expected_calls("sheep.graze") == []
 
 
 def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
     rewards = [0.0]
     once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
     removed = {"remove": "a", "point": "sheep.graze"}
-    env = make_env(aec_env, speaking(HELLO, CALL, DECIDED, removed, {"end": {}}), once)
-    env.reset(seed=1)
+    env = begun(make_env(aec_env, speaking(HELLO, CALL, DECIDED, removed, {"end": {}}), once), 1)
     number = child(env)
     with pytest.raises(IndexError):
         env.step(RULE)

@@ -59,7 +59,7 @@ def test_numbers_of_numpy_and_python_are_sent_as_json(value, sent):
     assert encode({"value": value}) == f'{{"value":{sent}}}\n'.encode()
 
 
-ROUND: list = []
+ROUND = []
 ROUND.append(ROUND)
 
 

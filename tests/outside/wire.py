@@ -1,16 +1,11 @@
 """The environment's side of the wire for tests, played by hand, byte by byte."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import threading
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 PATIENCE = 120.0
 """Seconds after which a process is killed, so that each wait has an end."""
@@ -50,11 +45,11 @@ VALUES = [None, True, *INTEGERS, *FLOATS, *TEXTS, *NAMED, *NESTED]
 class Child:
     """A process that speaks the wire, whose frames are written and read by hand."""
 
-    def __init__(self, *command: str | Path, **env: str) -> None:
+    def __init__(self, *command, **env):
         read_by_child, out = os.pipe()
         into, written_by_child = os.pipe()
         self.descriptors = (read_by_child, written_by_child)
-        self.decided: list[Any] = []
+        self.decided = []
         self.process = subprocess.Popen(
             [str(part) for part in command],
             env=os.environ | env | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)},
@@ -70,10 +65,10 @@ class Child:
         self._end = threading.Timer(PATIENCE, os.killpg, [self.process.pid, signal.SIGKILL])
         self._end.start()
 
-    def __enter__(self) -> Child:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._end.cancel()
         self.out.close()
         self.into.close()
@@ -81,30 +76,30 @@ class Child:
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.communicate()
 
-    def send(self, line: bytes = b"", **frame: Any) -> None:
+    def send(self, line=b"", **frame):
         """Send a frame, or bytes as they are."""
         data = line or json.dumps(frame).encode() + b"\n"
         with suppress(BrokenPipeError):
             while data:
                 data = data[self.out.write(data) :]
 
-    def receive(self) -> Any:
+    def receive(self):
         """The next frame; None where the child has closed its end."""
         line = self.into.readline()
         assert not line or line.endswith(b"\n")
         return json.loads(line, parse_constant=_refuse) if line else None
 
-    def begin(self, seed: Any = 0, **options: Any) -> Any:
+    def begin(self, seed=0, **options):
         """Start an episode; return the first frame of it."""
         self.send(start={"seed": seed, "options": options})
         return self.receive()
 
-    def act(self, number: int, value: Any) -> Any:
+    def act(self, number, value):
         """Answer a call; return the next frame."""
         self.send(act=number, value=value)
         return self.receive()
 
-    def rule(self, number: int) -> Any:
+    def rule(self, number):
         """Leave a call to the rule; return the next frame.
 
         What the rule decides is added to ``decided``.
@@ -117,9 +112,7 @@ class Child:
         self.decided.append(frame["value"])
         return self.receive()
 
-    def play(
-        self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any
-    ) -> tuple[list[Any], Any]:
+    def play(self, choose=None, seed=7, **options):
         """Play an episode, each call answered by ``choose`` or left to the rule.
 
         Return them, and the last frame.
@@ -131,11 +124,11 @@ class Child:
             frame = self.rule(number) if choose is None else self.act(number, choose(frame))
         return calls, frame
 
-    def ended(self) -> tuple[int, str, str]:
+    def ended(self):
         """Wait until the process has ended; return its status, its stdout and its stderr."""
         output, errors = self.process.communicate()
         return self.process.returncode, output.decode(), errors.decode()
 
 
-def _refuse(constant: str) -> None:
+def _refuse(constant):
     raise ValueError(f"{constant} is no JSON")

@@ -142,7 +142,7 @@ def test_values_in_mid_episode_are_those_of_the_pending_decision(view):
 def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
-    value = {"terminal_value": lambda env: np.array([10 + env.unwrapped.simulation.value])}
+    value = {"terminal_value": lambda env: np.array([10 + env.simulation.value])}
     found = action_values(env, actions, futures=3, **{"method": "replay"} | given, **value)
     reference = {name: given[name] for name in ("horizon", "discount") if name in given} | told
     terminal = None if given.get("discount") == 0 else lambda value: 10 + value
@@ -488,7 +488,7 @@ def test_branches_are_not_shown():
 
     env = begun(single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human"))
     told = action_values(
-        env, [1], futures=1, horizon=3, terminal_value=lambda env: env.unwrapped.simulation.pictures
+        env, [1], futures=1, horizon=3, terminal_value=lambda env: env.simulation.pictures
     )
     assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)
 

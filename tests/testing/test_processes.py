@@ -1,11 +1,9 @@
 """The check repeats a run in new processes, where sets of strings have another order."""
 
-import os
-import subprocess
-import sys
 import threading
 
 from simenv_marl.testing import check_simulation
+from tests.processes import python
 from tests.worlds import sets
 
 
@@ -44,13 +42,6 @@ def test_a_script_without_a_main_guard_can_be_checked(tmp_path):
         "    names = {*sets.NAMES}\n"
         "print(checked(Unordered))\n"
     )
-    paths = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        env={**os.environ, "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python(script)
     assert done.stdout.count("What was checked") == 1, done.stderr
     assert "another process" in done.stdout

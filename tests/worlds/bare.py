@@ -9,7 +9,7 @@ import os
 import sys
 
 
-def main() -> None:
+def main():
     """Play one episode after the other."""
     reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
     with open(reading) as lines, open(writing, "w", buffering=1) as out:

@@ -1,30 +1,27 @@
 """A simulation in a module of its own, whose environments are copied and pickled."""
 
-from __future__ import annotations
-
 import random
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import Definition, generate_env, make_step
+from simenv_marl import generate_env, make_step
 
 
-def observe(walk: Any) -> list[float]:
+def observe(walk):
     return [walk.place]
 
 
-def reward(walk: Any) -> float:
+def reward(walk):
     return -abs(walk.place)
 
 
-def to_step(action: int) -> int:
+def to_step(action):
     return action - 1
 
 
-def define(**changes: Any) -> Definition:
-    given: dict[str, Any] = {
+def define(**changes):
+    given = {
         "observation_space": spaces.Box(-100, 100, (1,), np.float32),
         "observation_space_mapping": observe,
         "action_space": spaces.Discrete(3),
@@ -37,28 +34,28 @@ def define(**changes: Any) -> Definition:
 class Walk:
     """A walk that decides where to go."""
 
-    def __init__(self, length: int = 5) -> None:
+    def __init__(self, length=5):
         self.length = length
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.random = random.Random(seed)
         self.place, self.steps = 0.0, []
         self.held = (step for step in self.steps)  # which cannot be pickled
 
-    def run(self) -> None:
+    def run(self):
         for _ in range(self.length):
             self.steps.append(self.choose())
             self.place += self.steps[-1] + self.drift() + self.random.random()
 
     @define(agent="walker_0")
-    def choose(self) -> int:
+    def choose(self):
         return self.random.choice([-1, 1])
 
-    def drift(self) -> float:
+    def drift(self):
         return 0.0
 
 
-def blow(walk: Walk) -> float:
+def blow(walk):
     return 0.25
 
 

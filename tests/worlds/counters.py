@@ -1,10 +1,7 @@
 """Models for vector environments, and what it means that two of these tell the same."""
 
-from __future__ import annotations
-
 import multiprocessing
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ FORKS = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:Dep
 """That numpy has threads does not matter here: they have nothing to do when a worker is forked."""
 
 
-def definition(**changes: Any) -> Any:
+def definition(**changes):
     """A definition for ``Counter.decide``."""
     return make_step(
         **{
@@ -44,12 +41,12 @@ class Counter:
     render_modes = ("ansi",)
     failing = False
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed=None, options=None):
         self.seed, self.options = seed, options
         self.random = np.random.default_rng(seed)
         self.count, self.goal = 0, int(self.random.integers(3, 12))
 
-    def run(self) -> Any:
+    def run(self):
         try:
             while self.count < self.goal:
                 self.count += self.decide()
@@ -59,11 +56,11 @@ class Counter:
             self.unwound = True
         return TRUNCATED if self.goal % 2 else None
 
-    def render(self, mode: str) -> str:
+    def render(self, mode):
         return f"{mode} {self.count}"
 
     @definition()
-    def decide(self) -> int:
+    def decide(self):
         return 1
 
 
@@ -73,7 +70,7 @@ POINT = f"{__name__}.Counter.decide"
 class Timed(Counter):
     """The same with a clock."""
 
-    def time(self) -> float:
+    def time(self):
         return 1.5 * self.count
 
 
@@ -86,7 +83,7 @@ NESTED = spaces.Dict(
     }
 )
 
-VARIETY: dict[str, tuple[Any, Any]] = {
+VARIETY = {
     "plain": (Counter, definition()),
     "timed": (Timed, definition()),
     "masked": (Timed, definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])),
@@ -144,7 +141,7 @@ same = partial(data_equivalence, exact=True)
 """Whether two results are equal to the dtype."""
 
 
-def alike(one: Any, other: Any) -> bool:
+def alike(one, other):
     """The same, but for how long it has taken; tensors are compared as arrays."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(
@@ -157,7 +154,7 @@ def alike(one: Any, other: Any) -> bool:
     return same(one, other)
 
 
-def legal_actions(envs: Any, infos: dict[str, Any], rng: np.random.Generator) -> Any:
+def legal_actions(envs, infos, rng):
     """A batch of actions out of the action space that the masks allow."""
     envs.action_space.seed(int(rng.integers(1000)))
     actions = envs.action_space.sample()
@@ -170,7 +167,7 @@ def legal_actions(envs: Any, infos: dict[str, Any], rng: np.random.Generator) ->
     return actions
 
 
-def agree(ours: Any, theirs: Any, steps: int, rng: np.random.Generator) -> None:
+def agree(ours, theirs, steps, rng):
     """Two vector environments tell the same, whatever happens."""
     disabled = ours.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     told = ours.reset(seed=5), theirs.reset(seed=5)
@@ -190,9 +187,7 @@ def agree(ours: Any, theirs: Any, steps: int, rng: np.random.Generator) -> None:
                 assert same(*told)
 
 
-def made(
-    design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, **options: Any
-) -> Any:
+def made(design, number, mode, *, sync=False, **options):
     """A vector environment of worlds of a design, ours or Gymnasium's; None if it is impossible."""
     points = points_of(design)
     policies = {points[point]: advised for point in design.policies} | {
@@ -211,7 +206,7 @@ def made(
     if not single and any(design.kinds[point] == "choices" for point in design.active):
         return None  # what is legal for one may be illegal by its turn
 
-    def source() -> World:
+    def source():
         return World(design, points)
 
     if not sync:

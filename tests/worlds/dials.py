@@ -1,7 +1,5 @@
 """A model with a picture, as a simulation and as an environment that was written by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium
@@ -15,35 +13,35 @@ from tests.worlds.models import define
 class Dial:
     """Is turned a few times, with another start in each episode."""
 
-    def __init__(self, episode: int) -> None:
+    def __init__(self, episode):
         self.place, self.turns = 1.0 + episode / 4, 0
 
     @property
-    def ended(self) -> bool:
+    def ended(self):
         return self.turns == 5
 
     @property
-    def truncated(self) -> bool:
+    def truncated(self):
         return self.place > 1.5
 
-    def choose(self) -> float:
+    def choose(self):
         return 0.5
 
-    def turn(self, by: float) -> None:
+    def turn(self, by):
         self.place, self.turns = self.place + by, self.turns + 1
 
-    def picture(self) -> Any:
+    def picture(self):
         return (np.arange(72).reshape(6, 4, 3) * (self.turns + 1) + int(self.place * 10)).astype(
             np.uint8
         )
 
 
-def turned_by(action: Any) -> float:
+def turned_by(action):
     return float(action[0] - action[1] / 2)
 
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
-SEEN: dict[str, tuple[spaces.Space[Any], Any]] = {
+SEEN = {
     "numbers": (
         spaces.Box(-10, 10, (4,), np.float32),
         lambda dial: np.array([dial.place, dial.turns, dial.place**2 / 10, 1], np.float32),
@@ -64,19 +62,19 @@ class DialSim:
     render_fps = 200
     episodes = 0
 
-    def reset(self) -> None:
+    def reset(self):
         self.episodes += 1
         self.dial = Dial(self.episodes)
 
-    def run(self) -> Any:
+    def run(self):
         while not self.dial.ended:
             self.dial.turn(self.dial.choose())
         return TRUNCATED if self.dial.truncated else None
 
-    def time(self) -> float:
+    def time(self):
         return float(self.dial.turns)
 
-    def render(self, mode: str) -> Any:
+    def render(self, mode):
         return self.dial.picture()
 
 
@@ -87,17 +85,17 @@ class DialEnv(gymnasium.Env[Any, Any]):
     action_space = ACTIONS
     episodes = 0
 
-    def __init__(self, seen: str = "numbers", *, render_mode: str | None = None) -> None:
+    def __init__(self, seen="numbers", *, render_mode=None):
         self.observation_space, self.look = SEEN[seen]
         self.render_mode = render_mode
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.episodes += 1
         self.dial = Dial(self.episodes)
         return self.look(self.dial), {"time": 0.0, "elapsed": 0.0}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.dial.turn(turned_by(action))
         ended, truncated = self.dial.ended, self.dial.truncated
         info = {"time": float(self.dial.turns), "elapsed": 1.0}
@@ -109,11 +107,11 @@ class DialEnv(gymnasium.Env[Any, Any]):
             info,
         )
 
-    def render(self) -> Any:
+    def render(self):
         return self.dial.picture()
 
 
-def points(seen: str) -> dict[Any, Any]:
+def points(seen):
     """The decision point of dials of which that is seen."""
     space, look = SEEN[seen]
     definition = define(
@@ -127,6 +125,6 @@ def points(seen: str) -> dict[Any, Any]:
     return {Dial.choose: definition}
 
 
-def dial_env(seen: str = "numbers", **options: Any) -> Any:
+def dial_env(seen="numbers", **options):
     """The single view of a simulation of dials."""
     return single_env(DialSim, points(seen), **options)

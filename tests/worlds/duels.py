@@ -1,10 +1,7 @@
 """A simulation for planning, and the values of its futures, computed without the library."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -22,19 +19,19 @@ class Duel:
     turns = 6
     ceiling = 1e9
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.random = random.Random(seed)
         self.value = self.clock = 0.0
         self.turn = 0
         self.retired = False
 
-    def reseed(self, seed: int) -> None:
+    def reseed(self, seed):
         self.random.seed(seed)
 
-    def time(self) -> float:
+    def time(self):
         return self.clock
 
-    def run(self) -> None:
+    def run(self):
         for turn in range(self.turns):
             self.turn = turn
             if not self.retired:
@@ -45,16 +42,16 @@ class Duel:
                 self.retired = True
             self.value -= self.right() * self.random.random()
 
-    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
+    def expected_calls(self, point):
         return [] if self.retired and point == LEFT else [(self,)]
 
-    def retire(self) -> None:
+    def retire(self):
         """The one on the left is not asked any more."""
 
-    def left(self) -> int:
+    def left(self):
         return 1
 
-    def right(self) -> int:
+    def right(self):
         return 1
 
 
@@ -69,18 +66,18 @@ RIGHT = f"{__name__}.Duel.right"
 SPACE = spaces.Box(-1e9, 1e9, (2,), np.float64)
 
 
-def observe(duel: Duel) -> list[float]:
+def observe(duel):
     return [duel.turn, duel.value]
 
 
-def points(**changes: Any) -> dict[Any, Any]:
+def points(**changes):
     """Both decision points; for the one on the left something may be different."""
-    alike: dict[str, Any] = {
+    alike = {
         "observation_space": SPACE,
         "observation_space_mapping": observe,
         "action_space": spaces.Discrete(3),
     }
-    left: dict[str, Any] = {
+    left = {
         "agent": "left",
         "reward_mapping": difference(lambda duel: duel.value),
         "removed_by": {f"{__name__}.Duel.retire": lambda duel: "left"},
@@ -92,23 +89,21 @@ def points(**changes: Any) -> dict[Any, Any]:
 Base = Callable[[list[float]], int]
 
 
-def rule(seen: list[float]) -> int:
+def rule(seen):
     return 1
 
 
 class Told(Duel):
     """A duel that is told what is decided, and notes what an agent is rewarded for."""
 
-    def __init__(
-        self, agent: str, at: int, action: int, future: int | None, bases: dict[str, Base]
-    ) -> None:
+    def __init__(self, agent, at, action, future, bases):
         self.agent, self.at, self.action, self.future, self.bases = agent, at, action, future, bases
         self.asked = 0
         # time and value at each decision of the agent from then on
-        self.marks: list[tuple[float, float]] = []
+        self.marks = []
         self.over = False
 
-    def _decide(self, agent: str) -> int:
+    def _decide(self, agent):
         number, self.asked = self.asked, self.asked + 1
         if number < self.at:
             return 1
@@ -121,34 +116,34 @@ class Told(Duel):
             return self.action
         return self.bases.get(agent, rule)(observe(self))
 
-    def left(self) -> int:
+    def left(self):
         return self._decide("left")
 
-    def right(self) -> int:
+    def right(self):
         return self._decide("right")
 
-    def retire(self) -> None:
+    def retire(self):
         if self.agent == "left" and not self.over:
             self.over = True
             self.marks.append((self.clock, self.value))
 
 
 def worth(
-    agent: str,
-    action: int,
-    future: int | None,
+    agent,
+    action,
+    future,
     *,
-    at: int = 0,
-    seed: int = 5,
-    model: type[Duel] = Duel,
-    bases: dict[str, Base] | None = None,
-    horizon: float | None = None,
-    timed_horizon: bool = False,
-    discount: float = 1.0,
-    timed: bool = False,
-    terminal: Callable[[float], float] | None = None,
-    both: bool = False,
-) -> float:
+    at=0,
+    seed=5,
+    model=Duel,
+    bases=None,
+    horizon=None,
+    timed_horizon=False,
+    discount=1.0,
+    timed=False,
+    terminal=None,
+    both=False,
+):
     """What an action of an agent is worth in a future, at the decision of that number."""
     told = Told(agent, at, action, future, bases or {})
     told.turns, told.ceiling = model.turns, model.ceiling

@@ -5,14 +5,10 @@ There are to be none.
 Run with ``python -m tests.worlds.exactness 10000``.
 """
 
-from __future__ import annotations
-
 import random
 import sys
 import warnings
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from simenv_marl import aec_env, branch, clone, parallel_env, single_env
 from tests.worlds import filing
@@ -21,10 +17,10 @@ from tests.worlds.random_worlds import POINTS, Design, Yard, outcome
 from tests.worlds.trips import move
 
 
-def tree_of_archive(chance: random.Random) -> list[bool]:
+def tree_of_archive(chance):
     """Whether branches and clones in a tree have their archive's outcome: files, generators."""
 
-    def step(env: Any) -> tuple[Any, bool]:
+    def step(env):
         told = env.step(3)
         return repr(told), told[2]
 
@@ -32,7 +28,7 @@ def tree_of_archive(chance: random.Random) -> list[bool]:
     return of_tree(chance, env, step, lambda env: env.unwrapped.simulation.log, ["fork"])
 
 
-def tree_of_yard(chance: random.Random) -> list[bool]:
+def tree_of_yard(chance):
     """Whether branches and clones in a tree have their yard's outcome: births, deaths, stacks."""
     design = Design(
         machines=chance.randint(1, 4),
@@ -43,25 +39,25 @@ def tree_of_yard(chance: random.Random) -> list[bool]:
         until=chance.choice([None, *range(3, 16)]),
     )
     make, driver = chance.choice([aec_env, parallel_env]), chance.choice(["greenlet", "thread"])
-    env: Any = make(lambda: Yard(design), POINTS, driver=driver)
+    env = make(lambda: Yard(design), POINTS, driver=driver)
     methods = ["replay", "fork"] if driver == "greenlet" else ["replay"]
     return of_tree(chance, env, move, lambda env: outcome(env.unwrapped.simulation), methods)
 
 
 def of_tree(
-    chance: random.Random,
-    env: Any,
-    step: Callable[[Any], tuple[Any, bool]],
-    come: Any,
-    methods: list[str],
-) -> list[bool]:
+    chance,
+    env,
+    step,
+    come,
+    methods,
+):
     """Whether an environment's clones, their clones and all branches have its outcome.
 
     All move in a random order. A ``step`` returns what is told, and whether it was the last one.
     ``come`` returns what has come of a simulation.
     """
 
-    def rest(env: Any, number: int, told: list[Any]) -> Any:
+    def rest(env, number, told):
         """All that is told to the end, and what has come."""
         told = [*told]
         while not (told and told[-1][1]):
@@ -69,7 +65,7 @@ def of_tree(
         return told, env.unwrapped.call(come)
 
     env.reset(seed=chance.randrange(2**31))
-    nodes: list[tuple[Any, list[Any]]] = [(env, [])]
+    nodes = [(env, [])]
     for _ in range(chance.randrange(20, 60)):
         one, told = chance.choice(nodes)
         if told and told[-1][1]:
@@ -78,7 +74,7 @@ def of_tree(
             nodes.append((clone(one, method=chance.choice(methods)), [*told]))
         else:
             told.append(step(one))
-    ends, branched = {}, list[Any]()
+    ends, branched = {}, []
     for one, told in chance.sample(nodes, len(nodes)):  # some outlive what they were cloned from
         if one.unwrapped.episode.pending is not None:
             branched += branch(one, partial(rest, told=told), method=chance.choice(methods))
@@ -90,9 +86,9 @@ def of_tree(
     return [each == own for each in (*ends.values(), *branched)]
 
 
-def differing(number: int, seed: int = 0) -> tuple[int, int]:
+def differing(number, seed=0):
     """How many of at least so many branches and clones differ, and of how many."""
-    chance, alike = random.Random(seed), list[bool]()
+    chance, alike = random.Random(seed), []
     while len(alike) < number:
         alike += chance.choice([tree_of_archive, tree_of_yard])(chance)
     return alike.count(False), len(alike)

@@ -1,7 +1,5 @@
 """A simulation with faults anywhere: in the model, its mappings, policies and handlers."""
 
-from __future__ import annotations
-
 import json
 import random
 from collections.abc import Callable
@@ -22,10 +20,10 @@ from tests.worlds.models import define, play
 class Beast:
     """One of those that decide one by one."""
 
-    def __init__(self, farm: Farm, number: int) -> None:
+    def __init__(self, farm, number):
         self.farm, self.number, self.come_by = farm, number, farm.come_by
 
-    def move(self) -> int:
+    def move(self):
         self.come_by("rule")
         return self.farm.random.randrange(5)
 
@@ -35,26 +33,26 @@ class Farm:
 
     render_modes = ("human",)
     rounds = 3
-    place: str | None = None
+    place = None
     happen: Callable[[], Any]
 
-    def come_by(self, place: str) -> None:
+    def come_by(self, place):
         if place == self.place:
             self.left -= 1
             if self.left == 0:
                 self.happen()
 
-    def let(self, happen: Callable[[], Any], place: str, time: int = 1) -> None:
+    def let(self, happen, place, time=1):
         """Let something happen at a place, when it is come by for the given time from now."""
         self.happen, self.place, self.left = happen, place, time
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.seed, self.now, self.log, self.caught = seed, 0, [], False
         self.come_by("reset")
         self.random = random.Random(seed)
         self.herd = [Beast(self, number) for number in range(3)]
 
-    def run(self) -> None:
+    def run(self):
         try:
             for _ in range(self.rounds):
                 self.come_by("run")
@@ -72,36 +70,36 @@ class Farm:
         finally:
             self.come_by("finally")
 
-    def plan(self) -> int:
+    def plan(self):
         self.come_by("rule")
         return self.random.randrange(10)
 
-    def pick(self) -> int:
+    def pick(self):
         self.come_by("rule")
         return 0
 
-    def work(self) -> int:
+    def work(self):
         self.come_by("rule")
         return self.random.randrange(3)
 
-    def remove(self, beast: Beast) -> None:
+    def remove(self, beast):
         self.herd.remove(beast)
 
-    def stop(self) -> None:
+    def stop(self):
         self.come_by("stop")
 
-    def close(self) -> None:
+    def close(self):
         self.come_by("close")
 
-    def time(self) -> float:
+    def time(self):
         self.come_by("time")
         return float(self.now)
 
-    def expected_calls(self, point: str) -> list[tuple[Beast]]:
+    def expected_calls(self, point):
         self.come_by("expected_calls")
         return [(beast,) for beast in self.herd] if point.endswith("move") else []
 
-    def render(self, mode: str) -> None:
+    def render(self, mode):
         self.come_by("render")
 
 
@@ -111,17 +109,17 @@ class Small(Farm):
     rounds = 1
 
 
-def at(place: str, value: Any) -> Callable[..., Any]:
+def at(place, value):
     """A mapping or handler at which something may happen, with that value."""
 
-    def mapping(*args: Any, **_: Any) -> Any:
+    def mapping(*args, **_):
         args[-1].come_by(place)
         return value(*args) if callable(value) else value
 
     return mapping
 
 
-def mapped(action: int, *, _simulation: Farm) -> int:
+def mapped(action, *, _simulation):
     _simulation.come_by("action")
     return action
 
@@ -155,11 +153,11 @@ POINTS = {
 }
 
 
-def vector(*args: Any, **options: Any) -> VectorEnv:
+def vector(*args, **options):
     return vector_env(*args, num_envs=2, **options)
 
 
-def vector_of_joint(*args: Any, **options: Any) -> VectorEnv:
+def vector_of_joint(*args, **options):
     return vector_env(*args, num_envs=2, view="joint", **options)
 
 
@@ -174,19 +172,19 @@ ONCE = ("reset", "finally", "stop", "close", "removed_by", "apply", "action")
 """What an episode does not come by three times."""
 
 
-def comes_by(view: Any, place: str) -> bool:
+def comes_by(view, place):
     """Whether an episode of the view comes by the place."""
     return view not in OF_ONE or place not in ("agent", "removed_by", "choices", "expected_calls")
 
 
-def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
+def farm_env(view, place=None, **options):
     """An environment of a farm that comes by ``place``, and its farm (a vector's first one)."""
 
-    def policy(observation: Any) -> int:
+    def policy(observation):
         farms[0].come_by("policy")
         return 2
 
-    farms: list[Farm] = []
+    farms = []
     points = POINTS | {PLAN: MAPPED_PLANNER if place == "action" else PLANNER}
     options["policies"] = {WORK: policy if place == "policy" else RULE}
     if place in ("before", "after", "instead"):
@@ -204,7 +202,7 @@ def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
     return env, farms[0]
 
 
-def take(env: Any, action: Any) -> Any:
+def take(env, action):
     """Have all who act take that action, in any view; return what the environment tells."""
     if isinstance(env, AECEnv):
         return env.step(action)
@@ -224,7 +222,7 @@ def take(env: Any, action: Any) -> Any:
 dumps = partial(json.dumps, default=lambda told: [told.dtype.name, told.tolist()])
 
 
-def run(env: Any, seed: int = 11) -> str:
+def run(env, seed=11):
     """Play an episode in any view, every third decision by its rule; return what it was like."""
     answers = (RULE if number % 3 == 0 else 0 for number in count())
     if isinstance(env, AECEnv):
@@ -235,7 +233,7 @@ def run(env: Any, seed: int = 11) -> str:
     return dumps(told)
 
 
-def cut_short(env: Any) -> None:
+def cut_short(env):
     """Begin an episode, take a step, and close the environment, or reset a vector."""
     env.reset(seed=11)
     take(env, RULE)

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +11,25 @@ sys.path.insert(0, str(Path(__file__).parent))
 import outside
 
 
-def _grandchild(wire: Any) -> None:
+def _grandchild(wire):
     """Leave behind what holds the pipes, and go."""
     subprocess.Popen(["sleep", "600"], pass_fds=(wire.writing, wire.lines.fileno()))
     os._exit(5)
 
 
-def _close(wire: Any) -> None:
+def _close(wire):
     os.close(wire.writing)
     time.sleep(600)
 
 
-def _flood(wire: Any) -> None:
+def _flood(wire):
     os.write(2, b"a last word\n")
     os.abort()
 
 
 UPDATE = {"update": "a", "point": "reservoir.inflow", "args": {}}
 
-FAULTS: dict[str, Callable[[Any], Any]] = {
+FAULTS = {
     "garbage": lambda wire: wire.raw(b"hello?\n"),
     "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
     "drop by drop": lambda wire: [(wire.raw(b"{"), time.sleep(0.05)) for _ in range(12_000)],
@@ -55,10 +54,10 @@ class Faulty:
     wire: Any
     what: str
 
-    def __init__(self, seed: int, options: dict[str, Any]) -> None:
+    def __init__(self, seed, options):
         self.options = options
 
-    def run(self, decide: Callable[..., Any], *_: Any) -> None:
+    def run(self, decide, *_):
         """Decide three times, then do it."""
         try:
             for _ in range(3):
@@ -73,7 +72,7 @@ class Faulty:
             FAULTS[self.what](self.wire)
             self.wire.receive()
 
-    def result(self) -> None:
+    def result(self):
         """Nothing came of it."""
 
 

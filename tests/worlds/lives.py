@@ -1,29 +1,22 @@
 """Simulations of beings that do in turn what a line of text says."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
-from typing import Any
-
-from tests.worlds.many_worlds import Being, banish
-from tests.worlds.models import Turn
+from simenv_marl import SimulationInterface
+from tests.worlds.many_worlds import Being, banish, being_of
 
 
-class Life:
+class Life(SimulationInterface):
     """A simulation of ten beings; ``now`` is told as its time where it is timed."""
 
-    def __init__(
-        self, program: str, announced: Iterable[int] | None, ends: Any, kind: type
-    ) -> None:
+    def __init__(self, program, announced, ends, kind):
         self.program, self.announced, self.ends, self.kind = program, announced, ends, kind
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.seed, self.now = seed, 0.0
-        self.log: list[Any] = []
-        self.asked: list[str] = []
+        self.log = []
+        self.asked = []
         self.beings = {number: self.kind(number) for number in range(10)}
 
-    def run(self) -> Any:
+    def run(self):
         for number, what, *value in map(str.split, self.program.split(", ")):
             if what == "o'clock":
                 self.now = float(number)
@@ -31,7 +24,7 @@ class Life:
                 self.happens(int(number), what, *map(int, value))
         return self.ends
 
-    def happens(self, number: int, what: str, *value: Any) -> None:
+    def happens(self, number, what, *value):
         """Let one thing happen to a being; whatever else it is is set."""
         if what == "acts":
             self.log.append(self.beings[number].act())
@@ -39,6 +32,9 @@ class Life:
             self.beings[number].leave()
         elif what == "banished":
             banish("nowhere", self.beings[number])
+        elif what == "ends":  # without any call that could be named
+            self.end_agent(None)  # nobody
+            self.end_agent(being_of(self.beings[number]))
         elif what == "forgotten":
             del self.beings[number]
         elif what == "fails":
@@ -50,19 +46,19 @@ class Life:
 class Announcing(Life):
     """One that knows who is going to decide."""
 
-    def expected_calls(self, point: str) -> list[tuple[Any]]:
+    def expected_calls(self, point):
         self.asked.append(point)
         return [(self.beings[number],) for number in self.announced or ()]
 
 
 def life(
-    program: str,
+    program,
     *,
-    announced: Iterable[int] | None = None,
-    timed: bool = False,
-    ends: Any = None,
-    kind: type = Being,
-) -> Callable[[], Life]:
+    announced=None,
+    timed=False,
+    ends=None,
+    kind=Being,
+):
     """A factory of lives, as ``life("0 acts, 0 health 5, 0 leaves, 1 acts")``."""
     base = Life if announced is None else Announcing
     if timed:
@@ -70,7 +66,7 @@ def life(
     return lambda: base(program, announced, ends, kind)
 
 
-def story(turns: Iterable[Turn]) -> str:
+def story(turns):
     """Who decides, is removed and is truncated, in the order of turns."""
     words = []
     for turn in turns:

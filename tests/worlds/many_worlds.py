@@ -5,11 +5,9 @@ decided makes creatures be born and die, decide twice, or never; ``Answered`` is
 the library, and notes what must come of it.
 """
 
-from __future__ import annotations
-
 import random
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -24,63 +22,63 @@ HERE = __name__
 class Being:
     """An entity that decides by ``act`` and goes by ``leave``."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number):
         self.number, self.health, self.whole = number, 0, True
 
-    def act(self) -> Any:
+    def act(self):
         return "rule"
 
-    def leave(self) -> None:
+    def leave(self):
         self.whole = False
 
 
 class Other:
     """An entity of another kind."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number):
         self.number = number
 
-    def act(self) -> Any:
+    def act(self):
         return "other rule"
 
-    def leave(self) -> None:
+    def leave(self):
         pass
 
 
-def banish(place: Any, being: Any) -> None:
+def banish(place, being):
     """Ends a being that is not what it is called on."""
     being.whole = False
 
 
-def being_of(being: Being) -> str:
+def being_of(being):
     """The agent of a being."""
     return f"being_{being.number}"
 
 
-def other_of(other: Other) -> str:
+def other_of(other):
     """The agent of another."""
     return f"other_{other.number}"
 
 
-def watch(being: Being) -> list[float]:
+def watch(being):
     """A being's health; that of one that is not whole any more is not to be seen."""
     assert being.whole, "observed after its end"
     return [being.number, being.health]
 
 
-def pay(being: Being) -> float:
+def pay(being):
     """A being's reward is its health."""
     assert being.whole, "rewarded after its end"
     return being.health
 
 
-def beings(**changes: Any) -> dict[Any, Any]:
+def beings(**changes):
     """The point of beings, which ``leave`` ends, but for what is changed."""
     given = {"agent": being_of, "observation_space_mapping": watch, "reward_mapping": pay}
     return {Being.act: define(**given | {"removed_by": f"{HERE}.Being.leave"} | changes)}
 
 
-def others(**changes: Any) -> dict[Any, Any]:
+def others(**changes):
     """The point of the others."""
     return {Other.act: define(**{"agent": other_of, "removed_by": f"{HERE}.Other.leave"} | changes)}
 
@@ -119,7 +117,7 @@ designs = st.builds(
 seeds = st.integers(0, 2**31 - 1)
 
 
-def answer(seed: int, agent: str, number: int) -> Any:
+def answer(seed, agent, number):
     """What an agent answers at its decision of that number, whoever asks."""
     return random.Random(f"{seed} {agent} {number}").choice([0, 1, 2, 3, 4, 4, RULE])
 
@@ -127,17 +125,17 @@ def answer(seed: int, agent: str, number: int) -> Any:
 class Creature:
     """Decides a number, on which depends who is born and who dies."""
 
-    def __init__(self, colony: Colony, number: int) -> None:
+    def __init__(self, colony, number):
         self.colony, self.number, self.decided = colony, number, 0
 
     @property
-    def name(self) -> str:
+    def name(self):
         return f"creature_{self.number}"
 
-    def act(self) -> int:
+    def act(self):
         return self.colony.random.randrange(5)
 
-    def die(self) -> None:
+    def die(self):
         self.colony.creatures.remove(self)
         self.colony.trace.append((self.name, "died"))
 
@@ -145,27 +143,27 @@ class Creature:
 class Colony:
     """A simulation of creatures."""
 
-    creature: Any = Creature
+    creature = Creature
 
-    def __init__(self, design: Design) -> None:
+    def __init__(self, design):
         self.design = design
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.seed = seed
         self.random = random.Random(seed)
-        self.trace: list[Any] = []
+        self.trace = []
         self.fortune = self.born = self.overseen = 0
-        self.creatures: list[Any] = []
-        self.queue: list[Any] = []
+        self.creatures = []
+        self.queue = []
         for _ in range(self.design.initial):
             self.bear()
 
-    def bear(self) -> None:
+    def bear(self):
         if self.born < self.design.most:
             self.creatures.append(self.creature(self, self.born))
             self.born += 1
 
-    def run(self) -> Any:
+    def run(self):
         for _ in range(self.design.ticks):
             self.queue = self.random.sample(self.creatures, len(self.creatures))
             if self.design.overseen == "before":
@@ -180,19 +178,19 @@ class Colony:
             self.trace.append("tick")
         return TRUNCATED if self.design.truncates else None
 
-    def oversee(self) -> int:
+    def oversee(self):
         return self.random.randrange(5)
 
-    def decide_itself(self) -> None:
+    def decide_itself(self):
         value = self.oversee()
         self.overseen += 1
         self.note("overseer_0", value)
 
-    def note(self, agent: str, value: int) -> None:
+    def note(self, agent, value):
         self.fortune = (self.fortune * 3 + value + self.random.randrange(4)) % 997
         self.trace.append((agent, value, self.fortune))
 
-    def decide(self, creature: Any, *, again: bool = True) -> None:
+    def decide(self, creature, *, again=True):
         value = creature.act()
         creature.decided += 1
         self.note(creature.name, value)
@@ -211,7 +209,7 @@ class Colony:
 class Announcing(Colony):
     """A colony that knows who is going to decide."""
 
-    def expected_calls(self, point: str) -> list[tuple[Any]]:
+    def expected_calls(self, point):
         return (
             [(creature,) for creature in self.creatures]
             if point.endswith("Creature.act")
@@ -226,47 +224,47 @@ class Answered(Colony):
     its end.
     """
 
-    def __init__(self, design: Design, seed: int | None = None, answers: Any = answer) -> None:
+    def __init__(self, design, seed=None, answers=answer):
         super().__init__(design)
         reference = self
 
         class AnsweredCreature(Creature):
-            def act(self) -> int:
+            def act(self):
                 return reference.asked(self.name, super().act)
 
-            def die(self) -> None:
+            def die(self):
                 reference.ends(self.name)
                 super().die()
 
         self.creature = AnsweredCreature
         self.answers = answers
-        self.decisions: list[str] = []
-        self.first: dict[str, int] = {}
-        self.last: dict[str, int] = {}
+        self.decisions = []
+        self.first = {}
+        self.last = {}
         self.reset(seed)
         self.ended = self.run()
         for agent in self.first:
             self.ends(agent)
 
-    def oversee(self) -> int:
+    def oversee(self):
         return self.asked("overseer_0", super().oversee)
 
-    def asked(self, agent: str, rule: Any) -> int:
+    def asked(self, agent, rule):
         self.first.setdefault(agent, self.fortune)
         value = self.answers(self.seed, agent, self.decisions.count(agent))
         self.decisions.append(agent)
         return rule() if value is RULE else value
 
-    def ends(self, agent: str) -> None:
+    def ends(self, agent):
         self.last.setdefault(agent, self.fortune)
 
     @property
-    def totals(self) -> dict[str, float]:
+    def totals(self):
         """What everybody who has decided was paid, where the change of the fortune is paid."""
         return {agent: float(self.last[agent] - self.first[agent]) for agent in self.first}
 
 
-def colony_points(*, overseen: bool) -> dict[Any, Any]:
+def colony_points(*, overseen):
     """The points of a colony, at which the change of its fortune is paid."""
     space = {"observation_space": spaces.Box(-1, 1e4, (3,), np.float64)}
     points = {
@@ -288,12 +286,10 @@ def colony_points(*, overseen: bool) -> dict[Any, Any]:
     return points
 
 
-_made: dict[Any, Any] = {}
+_made = {}
 
 
-def colony(
-    make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False
-) -> Any:
+def colony(make, design, simulation=Colony, *, roster=False):
     """An environment of a colony, also one made before.
 
     ``roster``: whether all possible agents are declared.
@@ -307,7 +303,38 @@ def colony(
     return _made[key]
 
 
-def advised(observation: Any, seed: int) -> Any:
+def advised(observation, seed):
     """The answer of whoever makes that observation."""
     number, decided = int(observation[0]), int(observation[1])
     return answer(seed, f"creature_{number}" if number >= 0 else "overseer_0", decided)
+
+
+def played(env, seed, look=lambda agent: None):
+    """Play a colony; check PettingZoo's books at every step, and look at each decision.
+
+    Returns who decided, the totals and the ends.
+    """
+    env.reset(seed=seed)
+    decided, totals, ends = [], Counter(), {}
+    booked = Counter(env.rewards)
+    for agent in env.agent_iter():
+        assert agent not in ends
+        assert agent in env.agents
+        assert len(set(env.agents)) == len(env.agents)
+        for book in (env.rewards, env.terminations, env.truncations, env.infos):
+            assert set(book) == set(env.agents)
+        observation, reward, terminated, truncated, _ = env.last()
+        assert observation in env.observation_space(agent)
+        totals[agent] += reward
+        assert type(reward) is float
+        assert type(terminated) is type(truncated) is bool
+        if terminated or truncated:
+            ends[agent] = (terminated, truncated)
+            env.step(None)
+        else:
+            look(agent)
+            env.step(answer(seed, agent, decided.count(agent)))
+            decided.append(agent)
+        booked.update(env.rewards)
+    assert {a: t for a, t in booked.items() if t} == {a: t for a, t in totals.items() if t}
+    return decided, totals, ends

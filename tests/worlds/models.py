@@ -1,10 +1,8 @@
 """What the tests share: definitions, simulations and players."""
 
-from __future__ import annotations
-
 import gc
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from time import sleep
 from typing import Any, NamedTuple
 from weakref import WeakSet
@@ -14,10 +12,10 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from simenv_marl import RULE, Definition, make_step
+from simenv_marl import RULE, make_step
 
 
-def plainly(value: Any) -> str:
+def plainly(value):
     """The name of a test with that value: the same in every process, without memory addresses."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
@@ -25,9 +23,9 @@ def plainly(value: Any) -> str:
 PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 
 
-def define(**changes: Any) -> Definition:
+def define(**changes):
     """A definition that returns the action, observes (1, 2) and rewards 0, but for ``changes``."""
-    given: dict[str, Any] = {
+    given = {
         "observation_space": PAIR,
         "observation_space_mapping": lambda *args, **kwargs: [1.0, 2.0],
         "action_space": spaces.Discrete(10),
@@ -39,10 +37,10 @@ def define(**changes: Any) -> Definition:
     return make_step(**given | changes)
 
 
-def decision(rule: Callable[..., Any] | None = None, /, **changes: Any) -> Any:
+def decision(rule=None, /, **changes):
     """A decision function of its own, whose rule says "rule"."""
 
-    def choose() -> Any:
+    def choose():
         return "rule"
 
     return define(**changes)(rule or choose)
@@ -51,35 +49,35 @@ def decision(rule: Callable[..., Any] | None = None, /, **changes: Any) -> Any:
 class Script:
     """A simulation without a base class, whose main loop is a function of it."""
 
-    def __init__(self, main: Callable[[Any], Any]) -> None:
+    def __init__(self, main):
         self.main = main
         self.episodes = 0
 
-    def reset(self, seed: int | None = None, options: Any = None) -> None:
+    def reset(self, seed=None, options=None):
         self.seed, self.options = seed, options
-        self.log: list[Any] = []
+        self.log = []
         self.episodes += 1
 
-    def run(self) -> Any:
+    def run(self):
         return self.main(self)
 
 
 class Timed(Script):
     """A script whose clock is ten ahead for each entry of its log."""
 
-    def time(self) -> float:
+    def time(self):
         return 10.0 * len(self.log)
 
 
-def script(main: Callable[[Any], Any]) -> Callable[[], Script]:
+def script(main):
     """A factory of simulations with that main loop, which may write to ``simulation.log``."""
     return lambda: Script(main)
 
 
-def calling(*functions: Callable[[], Any], ends: Any = None) -> Callable[[], Script]:
+def calling(*functions, ends=None):
     """A factory of simulations that call functions one after the other and log what they return."""
 
-    def main(simulation: Any) -> Any:
+    def main(simulation):
         for function in functions:
             simulation.log.append(function())
         return ends
@@ -87,16 +85,22 @@ def calling(*functions: Callable[[], Any], ends: Any = None) -> Callable[[], Scr
     return script(main)
 
 
-def unwinding(decide: Callable[[], Any], log: list[Any]) -> Callable[[], Script]:
+def unwinding(decide, log):
     """A factory of simulations that decide once, and tell when they have ended."""
 
-    def main(simulation: Any) -> None:
+    def main(simulation):
         try:
             decide()
         finally:
             log.append("unwound")
 
     return script(main)
+
+
+def begun(env, seed=None):
+    """An environment in which an episode has begun."""
+    env.reset(seed=seed)
+    return env
 
 
 class Turn(NamedTuple):
@@ -111,9 +115,7 @@ class Turn(NamedTuple):
     action: Any
 
 
-def play(
-    env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool = True
-) -> list[Turn]:
+def play(env, actions=RULE, *, seed=None, reset=True):
     """Play an AEC environment to its end.
 
     ``actions`` is one action for all decisions, an iterator of them, a dict from agents to either,
@@ -136,7 +138,7 @@ def play(
     return turns
 
 
-def step(env: Any, action: Any, agent: str) -> bool:
+def step(env, action, agent):
     """Take an action of an agent in any view. Returns whether that has ended it."""
     if isinstance(env, AECEnv):
         env.step(action)
@@ -149,7 +151,7 @@ def step(env: Any, action: Any, agent: str) -> bool:
     )
 
 
-def follow_the_rule(env: Any, seed: int | None = None) -> Any:
+def follow_the_rule(env, seed=None):
     """Let the rule decide throughout, in any view. Returns the simulation."""
     if isinstance(env, AECEnv):
         play(env, seed=seed)
@@ -164,22 +166,22 @@ def follow_the_rule(env: Any, seed: int | None = None) -> Any:
     return env.unwrapped.simulation
 
 
-def decisions(turns: list[Turn]) -> list[str]:
+def decisions(turns):
     """The agents in the order in which they decided."""
     return [turn.agent for turn in turns if not (turn.terminated or turn.truncated)]
 
 
-def rewards_of(turns: list[Turn], agent: str) -> list[float]:
+def rewards_of(turns, agent):
     """An agent's rewards for its actions, in order, without the reward before the first one."""
     return [turn.reward for turn in turns if turn.agent == agent][1:]
 
 
-def notes(error: BaseException) -> str:
+def notes(error):
     """All notes of an error."""
     return "\n".join(getattr(error, "__notes__", ()))
 
 
-def culprits(error: BaseException) -> list[str]:
+def culprits(error):
     """The names of the functions that an error's traceback leads through, the culprit last."""
     names, trace = [], error.__traceback__
     while trace is not None:
@@ -188,13 +190,13 @@ def culprits(error: BaseException) -> list[str]:
     return names
 
 
-def alive(kind: type) -> int:
+def alive(kind):
     """The number of objects of a type since the file of tests began, after a collection."""
     gc.collect()
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
-def stacks(before: WeakSet[Any] | None = None) -> WeakSet[Any]:
+def stacks(before=None):
     """The greenlets since the file of tests began, without each thread's own (which has no parent).
 
     Those that were there ``before`` are left out. Of environments that hold others one goes at a
@@ -216,6 +218,6 @@ def stacks(before: WeakSet[Any] | None = None) -> WeakSet[Any]:
 _unattended = decision()
 
 
-def nobody_is_asked() -> bool:
+def nobody_is_asked():
     """Whether no simulation counts as running in this thread: decision functions are rules."""
     return bool(_unattended() == "rule")

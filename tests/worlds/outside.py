@@ -10,9 +10,7 @@ import json
 import os
 import random
 import sys
-from collections.abc import Callable
 from math import inf
-from typing import Any
 
 
 class Stopped(BaseException):
@@ -25,15 +23,13 @@ class Reservoirs:
     Whoever operates one says how much is let in; a broker, now and then, sets the price.
     """
 
-    def __init__(self, seed: int, options: dict[str, Any]) -> None:
+    def __init__(self, seed, options):
         self.random = random.Random(seed)
         self.hours, self.words = options.get("hours", 12), options.get("words", 0)
         self.levels = {"a": 4.0, "b": 6.0}
         self.price, self.time, self.born, self.log = 1.0, 0.0, 0, []
 
-    def run(
-        self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]
-    ) -> None:
+    def run(self, decide, remove, update):
         """The main loop: decisions by ``decide``, removals by ``remove``, changes by ``update``."""
         for hour in range(self.hours):
             if self.words:
@@ -71,11 +67,11 @@ class Reservoirs:
                     lambda: self.price * 1.1,
                 )
 
-    def result(self) -> dict[str, Any]:
+    def result(self):
         """What came of it."""
         return {"levels": self.levels, "price": self.price, "log": self.log}
 
-    def by_its_rule(self) -> dict[str, Any]:
+    def by_its_rule(self):
         """What comes of it by its own rule."""
         self.run(
             lambda point, entity, time, arguments, rule: rule(),
@@ -88,34 +84,31 @@ class Reservoirs:
 class Wire:
     """The simulator's end."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
         self.lines = open(reading, encoding="utf-8")  # noqa: SIM115
         self.writing = writing
         self.number = 0
         self.tells = "tells" in sys.argv  # what the rule decides
-        self.model: Any = None
+        self.model = None
 
-    def send(self, frame: dict[str, Any]) -> None:
+    def send(self, frame):
         """Send a frame."""
         self.raw(json.dumps(frame).encode() + b"\n")
 
-    def raw(self, line: bytes) -> None:
+    def raw(self, line):
         """Send any bytes."""
         while line:
             line = line[os.write(self.writing, line) :]
 
-    def receive(self) -> dict[str, Any]:
+    def receive(self):
         """Wait for a frame; the process ends where none can come any more."""
         line = self.lines.readline()
         if not line:
             sys.exit()
-        frame: dict[str, Any] = json.loads(line)
-        return frame
+        return json.loads(line)
 
-    def decide(
-        self, point: str, entity: Any, time: float | None, arguments: Any, rule: Callable[[], Any]
-    ) -> Any:
+    def decide(self, point, entity, time, arguments, rule):
         """Have something decided."""
         self.number += 1
         frame = {
@@ -140,17 +133,15 @@ class Wire:
             self.send({"decided": self.number, "value": value})
         return value
 
-    def remove(self, point: str, entity: str) -> None:
+    def remove(self, point, entity):
         """Say that an entity is gone."""
         self.send({"remove": entity, "point": point})
 
-    def update(self, point: str, entity: str, arguments: Any) -> None:
+    def update(self, point, entity, arguments):
         """Say what the arguments of an entity would be by now."""
         self.send({"update": entity, "point": point, "args": arguments})
 
-    def play(
-        self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf
-    ) -> None:
+    def play(self, make, points, episodes=inf):
         """Play so many episodes."""
         self.send(
             {"hello": 1, "points": points, "can": ["reseed", *(["decided"] if self.tells else [])]}
@@ -171,7 +162,7 @@ class Wire:
 POINTS = ["reservoir.inflow", "broker.price"]
 
 
-def main() -> None:
+def main():
     """Play to an environment, or by the model's rule, with the result on the standard output."""
     numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
     if "SIMENV_MARL_FDS" in os.environ:

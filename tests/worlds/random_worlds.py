@@ -4,12 +4,8 @@ A ``Yard`` is made of SimPy processes, nested generators, births and deaths. Wha
 in its ``trace`` and its generator, and depends on every decision and on their order.
 """
 
-from __future__ import annotations
-
 import random
-from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import simpy
@@ -59,17 +55,17 @@ seeds = st.integers(0, 2**31 - 1)
 class Machine:
     """Decides how much to load, by a method, and how fast to go, by a generator."""
 
-    def __init__(self, yard: Yard, number: int) -> None:
+    def __init__(self, yard, number):
         self.yard, self.number, self.decided = yard, number, 0
 
-    def load(self) -> int:
+    def load(self):
         return self.yard.random.randrange(1, 5)
 
-    def pace(self) -> Generator[Any, Any, int]:
+    def pace(self):
         yield self.yard.clock.timeout(self.yard.random.randrange(2))
         return self.yard.random.randrange(1, 4)
 
-    def work(self) -> Generator[Any, Any, None]:
+    def work(self):
         yard = self.yard
         for _ in range(yard.design.jobs):
             yield yard.clock.timeout(yard.random.randrange(3))
@@ -94,68 +90,68 @@ class Yard:
 
     render_modes = ("ansi",)
 
-    def __init__(self, design: Design) -> None:
+    def __init__(self, design):
         self.design = design
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.seed, self.random = seed, random.Random(seed)
-        self.trace: list[Any] = []
+        self.trace = []
         self.fortune = self.built = self.planned = 0
-        self.machines: list[Machine] = []
-        self.retired: list[Machine] = []  # held, for a reward of whom nobody holds any more is lost
+        self.machines = []
+        self.retired = []  # held, for a reward of whom nobody holds any more is lost
         self.clock = simpy.Environment()
         self.cranes = simpy.Resource(self.clock, self.design.cranes)
         for _ in range(self.design.machines):
             self.build()
 
-    def run(self) -> Any:
+    def run(self):
         self.clock.process(self.manage())
         self.clock.run(self.design.until)
         return TRUNCATED if self.design.until else None
 
-    def build(self) -> None:
+    def build(self):
         if self.built < MOST:
             machine = Machine(self, self.built)
             self.built += 1
             self.machines.append(machine)
             self.clock.process(self.working(machine))
 
-    def working(self, machine: Machine) -> Generator[Any, Any, None]:
+    def working(self, machine):
         yield from machine.work()
         if machine in self.machines:
             self.machines.remove(machine)
             self.retired.append(machine)
 
-    def scrap(self, machine: Machine) -> None:
+    def scrap(self, machine):
         self.machines.remove(machine)
         self.trace.append(("scrapped", machine.number))
 
-    def manage(self) -> Generator[Any, Any, None]:
+    def manage(self):
         while self.machines:
             self.note("plan", self.plan(), self.clock.now)
             self.planned += 1
             yield self.clock.timeout(self.design.plans)
 
-    def plan(self) -> int:
+    def plan(self):
         return self.random.randrange(5)
 
-    def note(self, *what: Any) -> None:
+    def note(self, *what):
         self.fortune = (self.fortune * 3 + what[1] + self.random.randrange(4)) % 997
         self.trace.append((self.clock.now, *what, self.fortune))
 
-    def state(self) -> list[float]:
+    def state(self):
         return [self.fortune, self.clock.now]
 
-    def time(self) -> float:
+    def time(self):
         return float(self.clock.now)
 
-    def render(self, mode: str) -> str:
+    def render(self, mode):
         return str(self.trace[-1:])
 
 
 SPACE = {"observation_space": spaces.Box(-1, 1e4, (4,), np.float64)}
 SCRAPPED = f"{HERE}.Yard.scrap"
-POINTS: dict[str, Any] = {
+POINTS = {
     f"{HERE}.Yard.plan": define(
         agent="planner",
         observation_space_mapping=lambda yard: [-1, yard.planned, yard.fortune, yard.seed % 997],
@@ -179,13 +175,13 @@ POINTS: dict[str, Any] = {
 PLAN = {f"{HERE}.Yard.plan": POINTS[f"{HERE}.Yard.plan"]}
 
 
-def advised(observation: Any) -> Any:
+def advised(observation):
     """The answer to an observation of a machine or of the yard: an action, or the rule."""
     number, decided, _, seed = (int(value) for value in observation)
     return random.Random(f"{seed} {number} {decided}").choice([1, 2, 3, 4, RULE])
 
 
-def plain(design: Design, seed: int) -> Yard:
+def plain(design, seed):
     """A yard that has run on its own."""
     yard = Yard(design)
     yard.reset(seed)
@@ -193,6 +189,6 @@ def plain(design: Design, seed: int) -> Yard:
     return yard
 
 
-def outcome(yard: Any) -> Any:
+def outcome(yard):
     """All that has come of a yard."""
     return yard.trace, yard.fortune, yard.built, yard.clock.now, yard.random.getstate()

@@ -1,22 +1,21 @@
 """What tests put back, or make sure of, when they are over."""
 
-from __future__ import annotations
-
 import gc
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import gymnasium
 import pettingzoo
+import pytest
+
+from tests.worlds.models import notes
 
 MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
 """The modules that pages of the documentation import from the folder they are in."""
 
 
 @contextmanager
-def registries_put_back() -> Iterator[None]:
+def registries_put_back():
     """Put back what Gymnasium's and PettingZoo's registries held."""
     names = ("aec_registry", "parallel_registry")  # older releases have none
     registries = (
@@ -33,7 +32,7 @@ def registries_put_back() -> Iterator[None]:
 
 
 @contextmanager
-def models_of_pages_forgotten() -> Iterator[None]:
+def models_of_pages_forgotten():
     """Have the models of pages imported anew, and forget them afterwards.
 
     Names of decision points would find the decorated functions of an earlier import as long as
@@ -46,14 +45,14 @@ def models_of_pages_forgotten() -> Iterator[None]:
         _forget_models_of_pages()
 
 
-def _forget_models_of_pages() -> None:
+def _forget_models_of_pages():
     for model in MODELS_OF_PAGES:
         sys.modules.pop(model, None)
     gc.collect()
 
 
 @contextmanager
-def left_as_they_were(*places: Any) -> Iterator[None]:
+def left_as_they_were(*places):
     """Make sure that classes and modules hold at the end just what they held."""
     before = [held(place) for place in places]
     yield
@@ -63,10 +62,19 @@ def left_as_they_were(*places: Any) -> Iterator[None]:
         assert all(now[name] is then[name] for name in now)
 
 
-def held(place: Any) -> dict[str, Any]:
+def held(place):
     """What a class or module holds, but for what Python adds."""
     return {
         name: value
         for name, value in vars(place).items()
         if not name.startswith("__") or name == "__init__"
     }
+
+
+@contextmanager
+def fails(error, *words, match=None):
+    """Expect an error whose notes have all of these words."""
+    with pytest.raises(error, match=match) as caught:
+        yield caught
+    for word in words:
+        assert word in notes(caught.value)

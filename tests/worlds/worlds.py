@@ -6,13 +6,9 @@ decides when, what it observes, what it is paid and what the model comes to. It 
 environment, stack or greenlet.
 """
 
-from __future__ import annotations
-
 import random
-from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 from gymnasium import spaces
 from hypothesis import strategies as st
@@ -54,7 +50,7 @@ class Design:
     max_steps: int | None = None
 
     @property
-    def active(self) -> list[int]:
+    def active(self):
         """The points that the environment's user answers."""
         return [
             point for point in range(len(self.kinds)) if point not in self.policies | self.rules
@@ -62,7 +58,7 @@ class Design:
 
 
 @st.composite
-def designs(draw: Any) -> Design:
+def designs(draw):
     """Any design in which at least one decision is the user's."""
     number = draw(st.integers(1, 4))
     kinds = tuple(draw(st.sampled_from(KINDS)) for _ in range(number))
@@ -93,34 +89,34 @@ There are enough of them.
 """
 
 
-def agent_of(kind: str, point: int, entity: int) -> str | None:
+def agent_of(kind, point, entity):
     """Who decides a call."""
     if kind == "sometimes" and entity == 0:
         return None
     return f"point_{point}_{entity}" if kind in ("entity", "sometimes") else f"point_{point}"
 
 
-def watched(level: int, calls: int) -> list[int]:
+def watched(level, calls):
     """What everybody observes."""
     return [level, calls]
 
 
-def paid(level: int, point: int) -> float:
+def paid(level, point):
     """What whoever decides at a point is paid."""
     return (level * (point + 2) % 23 - 9) / 8
 
 
-def offered(level: int) -> list[int]:
+def offered(level):
     """The choices at a level."""
     return [level % 5 + number for number in range(1 + level % 3)]
 
 
-def advised(observation: Any, info: Any) -> int:
+def advised(observation, info):
     """What a policy answers: the level that it observes, made legal."""
     return legal(int(observation[0]), info)
 
 
-def legal(answer: Any, info: Any) -> Any:
+def legal(answer, info):
     """An answer among those that a mask allows: the first ones, or any of ten."""
     return answer if answer is RULE else answer % (int(info["action_mask"].sum()) if info else 10)
 
@@ -128,22 +124,22 @@ def legal(answer: Any, info: Any) -> Any:
 class Entity:
     """What some of the points are decided for."""
 
-    def __init__(self, world: World, number: int) -> None:
+    def __init__(self, world, number):
         self.world, self.number = world, number
 
 
 class World:
     """A simulation of a design."""
 
-    def __init__(self, design: Design, points: list[Callable[..., Any]]) -> None:
+    def __init__(self, design, points):
         self.design, self.points = design, points
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.random = random.Random(seed)
-        self.level, self.calls, self.trace = self.random.randrange(50), 0, list[Any]()
+        self.level, self.calls, self.trace = self.random.randrange(50), 0, []
         self.entities = [Entity(self, number) for number in range(3)]
 
-    def run(self) -> Any:
+    def run(self):
         for point, entity in self.design.program:
             value = self.call(point, entity)
             self.calls += 1
@@ -151,7 +147,7 @@ class World:
             self.trace.append((point, value, self.level))
         return TRUNCATED if self.design.truncates else None
 
-    def call(self, point: int, entity: int) -> int:
+    def call(self, point, entity):
         kind, function = self.design.kinds[point], self.points[point]
         if kind == "keyword":
             return function(self, number=entity)
@@ -161,20 +157,20 @@ class World:
             return next(iter_value(function(self)))
         return function(self)
 
-    def rule(self, point: int) -> int:
+    def rule(self, point):
         value = self.random.randrange(7)
         if self.design.kinds[point] == "nested" and point > 0:
             value += self.call(point - 1, value % 3)
         return value
 
 
-def iter_value(generator: Any) -> Iterable[int]:
+def iter_value(generator):
     """The one value of a generator, as an iterator."""
     value = yield from generator
     yield value
 
 
-def points_of(design: Design) -> list[Callable[..., Any]]:
+def points_of(design):
     """Decision functions of a design, whose rules are those of the world."""
     return [
         _point(kind, number, number in design.differences)
@@ -182,11 +178,11 @@ def points_of(design: Design) -> list[Callable[..., Any]]:
     ]
 
 
-def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
-    def world_of(thing: Any) -> World:
+def _point(kind, point, by_difference):
+    def world_of(thing):
         return thing.world if isinstance(thing, Entity) else thing
 
-    changes: dict[str, Any] = {
+    changes = {
         "agent": f"point_{point}",
         "observation_space_mapping": lambda thing, **_: watched(
             world_of(thing).level, world_of(thing).calls
@@ -197,24 +193,24 @@ def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
         changes["reward_mapping"] = difference(lambda thing, **_: world_of(thing).level / 4)
 
     class Rules:
-        def of_world(self: Any) -> Any:
+        def of_world(self):
             return self.rule(point)
 
-        def keyword(self: Any, *, number: int) -> Any:
+        def keyword(self, *, number):
             return self.rule(point)
 
-        def generator(self: Any) -> Any:
+        def generator(self):
             if point < 0:
                 yield
             return self.rule(point)
 
-        def of_entity(self: Any) -> Any:
+        def of_entity(self):
             return self.world.rule(point)
 
-    def function(world: World) -> Any:
+    def function(world):
         return world.rule(point)
 
-    rule: Any = Rules.of_world
+    rule = Rules.of_world
     if kind == "function":
         rule = function
     elif kind in ("entity", "sometimes"):
@@ -256,32 +252,32 @@ class Reference(World):
         trace: What the model has noted.
     """
 
-    def __init__(self, design: Design, seed: int, answers: list[Any]) -> None:
+    def __init__(self, design, seed, answers):
         super().__init__(design, [])
-        self.turns: list[Told] = []
-        self.ends: dict[str, Told] | None = None
+        self.turns = []
+        self.ends = None
         self.truncated = False
-        self._decided: dict[str, int] = {}
-        self._remembered: dict[str, int] = {}
+        self._decided = {}
+        self._remembered = {}
         self._given, self._steps = iter(answers), 0
         self.reset(seed)
         with suppress(_PendingError):
             self._end(truncated=self.run() is TRUNCATED)
 
-    def _end(self, *, truncated: bool) -> None:
+    def _end(self, *, truncated):
         self.truncated = truncated
         self.ends = {
             agent: Told(agent, watched(self.level, self.calls), self._paid(agent, point))
             for agent, point in self._decided.items()
         }
 
-    def _paid(self, agent: str, point: int) -> float:
+    def _paid(self, agent, point):
         if point not in self.design.differences:
             return paid(self.level, point)
         before, self._remembered[agent] = self._remembered.get(agent, self.level), self.level
         return (self.level - before) / 4
 
-    def call(self, point: int, entity: int) -> int:
+    def call(self, point, entity):
         """Who decides is told so, and does what was answered."""
         kind = self.design.kinds[point]
         agent = agent_of(kind, point, entity)
@@ -303,7 +299,7 @@ class Reference(World):
         self._steps += 1
         return self.rule(point) if answer is RULE else self._value(kind, answer)
 
-    def _value(self, kind: str, answer: int) -> int:
+    def _value(self, kind, answer):
         if kind == "choices":
             choices = offered(self.level)
             return choices[answer % len(choices)]

@@ -5,6 +5,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -51,7 +52,8 @@ def append_line(path: Path, line: bytes) -> None:
 # -- answers --------------------------------------------------------------------------------------
 
 
-class Question(NamedTuple):
+@dataclass(frozen=True)
+class Question:
     """A decision, as recordings identify it."""
 
     seed: int
@@ -61,22 +63,23 @@ class Question(NamedTuple):
     """The digest of the observation."""
     legal: str | None = None
     """The digest of the legal actions. None: any; older recordings do not have it."""
-    policy: Mapping[str, str] = {}
+    policy: Mapping[str, str] = field(default_factory=dict)
     """The identity of the policy, such as a language model's name and the digest of its prompt."""
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True)
+class Outcome:
     """The answer to a decision."""
 
     action: Action
     """The action as ``action_space_mapping`` receives it, or ``RULE``."""
-    extras: Mapping[str, Any] = {}
+    extras: Mapping[str, Any] = field(default_factory=dict)
     """The extras of the answer, for data sets."""
     by: str = "policy"
     """Who has answered: "policy" or "fallback"."""
     why: str = ""
     """The latest fault of the policy in this decision."""
-    counts: Mapping[str, int] = {}
+    counts: Mapping[str, int] = field(default_factory=dict)
     """The numbers that a ``FallbackPolicy`` has counted in this decision."""
 
     @property
@@ -85,7 +88,8 @@ class Outcome(NamedTuple):
         return (self.action, self.extras) if self.extras else self.action
 
 
-class _Sample(NamedTuple):
+@dataclass(frozen=True)
+class _Sample:
     """An action as JSON in a recording of an older version."""
 
     json: Any
@@ -151,8 +155,8 @@ class Recording:
         """Append the outcome of a decision."""
         action = None if outcome.action is RULE else encode(decision.action_space, outcome.action)
         extras = {name: _encode_part(part) for name, part in outcome.extras.items()}
-        outcome = outcome._replace(action=action, extras=extras)
-        parts = question._asdict() | outcome._asdict() | {"run": self._run}
+        outcome = replace(outcome, action=action, extras=extras)
+        parts = vars(question) | vars(outcome) | {"run": self._run}
         entry = {name: part for name, part in parts.items() if part not in ("", {})}
         append_line(self.path, json.dumps(entry, ensure_ascii=False).encode())
         lines = self._lines_of(question)
@@ -174,8 +178,8 @@ class Recording:
                 except (TypeError, LookupError):
                     warn_user(f"line {number} of {self.path} is no answer, and is left out")
                     continue
-                self._lines[line.question[:2]].append(line)
-        return self._lines[question[:2]]
+                self._lines[line.question.seed, line.question.agent].append(line)
+        return self._lines[question.seed, question.agent]
 
     def _check_policy(self, question: Question, asked: Question) -> None:
         differing = [
@@ -233,23 +237,27 @@ def question_of(decision: Decision, policy: object) -> Question:
 
 def _line_of(entry: Mapping[str, Any]) -> _Line:
     """Return the line of an entry, also of one of an older version."""
-    question = Question(**{name: entry[name] for name in Question._fields if name in entry})
+    question = Question(**_parts(entry, Question))
     if "answer" in entry:  # an older version
         sample = entry["answer"]
         return _Line(question, Outcome(None if sample is None else _Sample(sample)), None)
-    outcome = Outcome(**{name: entry[name] for name in Outcome._fields if name in entry})
+    outcome = Outcome(**_parts(entry, Outcome))
     return _Line(question, outcome, entry["run"])
+
+
+def _parts(entry: Mapping[str, Any], kind: type[Question | Outcome]) -> dict[str, Any]:
+    return {part.name: entry[part.name] for part in fields(kind) if part.name in entry}
 
 
 def _decoded(outcome: Outcome, space: Space[Any]) -> Outcome:
     action = outcome.action
     extras = {name: _decode_part(part) for name, part in outcome.extras.items()}
-    outcome = outcome._replace(extras=extras)
+    outcome = replace(outcome, extras=extras)
     if action is None:
-        return outcome._replace(action=RULE)
+        return replace(outcome, action=RULE)
     if isinstance(action, _Sample):
-        return outcome._replace(action=space.from_jsonable(action.json)[0])
-    return outcome._replace(action=decode(space, action))
+        return replace(outcome, action=space.from_jsonable(action.json)[0])
+    return replace(outcome, action=decode(space, action))
 
 
 # -- actions as JSON ------------------------------------------------------------------------------

@@ -134,8 +134,9 @@ def buyer(page):
 def test_two_people_play_and_a_spectator_sees_it():
     server = Server("--seed", "5")  # which nobody else has used
     buyer, seller, spectator = server.page("buyer"), server.page("seller"), server.page()
-    everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
-    spectator.wait("people", lambda people: people == everybody)
+    everybody = {"buyer": 1, "seller": 1}
+    people = spectator.wait("people", lambda people: people["taken"] == everybody)
+    assert (people["spectators"], sorted(people["opened"])) == (1, ["buyer", "seller"])
     buyer.send(do="act", turn=0, action=2)
     assert seller.wait_for_turn(1)["pending"]["agent"] == "seller"
     seller.send(do="act", turn=1, action=[1, 1])

@@ -158,10 +158,16 @@ def form_of(
     ``fields``, and an ``answer``: the JSON of an action, with the index of a field in place of
     each value.
     """
-    if isinstance(space, Discrete) and space.n <= MOST_ANSWERS:
+    if isinstance(space, Discrete) and _are_few(space, mask):
         return {"cards": _options(space, mask, labels)}
     fields: list[Message] = []
     return {"answer": _answer(space, mask, labels, "", fields), "fields": fields}
+
+
+def _are_few(space: Discrete, mask: Mask | None) -> bool:
+    """Return whether the legal actions can be shown one by one."""
+    number = space.n if mask is None else np.count_nonzero(mask)
+    return int(number) <= MOST_ANSWERS
 
 
 def _options(
@@ -194,7 +200,7 @@ def _answer(
         return _answer(space, inner, None, f"{name} {label}".strip(), fields)
 
     match space:
-        case Discrete() if space.n <= MOST_ANSWERS:
+        case Discrete() if _are_few(space, mask):
             return _add(fields, name, options=_options(space, mask, labels))
         case Discrete() if mask is None:
             last = int(space.start + space.n - 1)

@@ -1,7 +1,9 @@
 """The game of the page: decisions, the way back, futures, limits, and recordings."""
 
 import json
+import random
 import struct
+import time
 import zlib
 from base64 import b64decode
 from dataclasses import replace
@@ -10,14 +12,29 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+import simenv_marl
 from simenv_marl import RULE, aec_env, simulate
+from simenv_marl.data import joint_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
-from simenv_marl.seats.play.forms import action_of, jsonable
+from simenv_marl.seats.play.forms import (
+    action_of,
+    complaint_about,
+    form_of,
+    jsonable,
+    shown,
+    words_of,
+)
 from simenv_marl.seats.play.game import Game
 from simenv_marl.seats.play.host import Host, Rules
+from simenv_marl.seats.play.recording import read
 from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
 from tests.worlds import models
+
+
+@pytest.fixture(autouse=True)
+def few_futures(monkeypatch):
+    monkeypatch.setattr("simenv_marl.seats.play.futures.FUTURES", 4)
 
 
 @pytest.fixture
@@ -200,7 +217,7 @@ def test_futures_are_tried_out_without_moving_the_game(make_host):
     settle(host)
     fan = think(host)
     assert [one["action"] for one in fan["candidates"]] == [None, 0, 1, 2, 3]
-    assert {one["n"] for one in fan["candidates"]} == {16}
+    assert {one["n"] for one in fan["candidates"]} == {4}
     assert fan["rule"] == 2
     rule, two = (one["bands"] for one in fan["candidates"] if one["action"] in (None, 2))
     assert rule == two  # the same futures for all candidates
@@ -241,8 +258,8 @@ def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_host):
     assert [one["action"] for one in think(host)["candidates"]] == [None]
     host.handle("seller", {"do": "try", "turn": 1, "action": [0, 2]})
     assert [(one["action"], one["n"]) for one in think(host)["candidates"]] == [
-        (None, 16),
-        ([0, 2], 16),
+        (None, 4),
+        ([0, 2], 4),
     ]
     with pytest.raises(InvalidActionError):
         host.handle("seller", {"do": "try", "turn": 1, "action": [2, 2]})
@@ -396,3 +413,266 @@ def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_ho
     assert state["turn"] == 2
     with pytest.raises(OptionValueError, match="cannot be written"):
         make_host(record=tmp_path / "missing" / "game.jsonl")
+
+
+def test_past_decisions_keep_the_words_of_their_decision(make_host):
+    host = make_host(BreakingShop, unit="day")
+    state = play(host, [2, 1])
+    words = [(row["agent"], row["words"], row["when"]) for row in state["history"]]
+    assert words == [("buyer", "order 2 of 1", "day 0"), ("buyer", "order 1 of 1", "day 1")]
+    host.handle("buyer", {"do": "undo"})
+    state = settle(host)
+    assert [row["words"] for row in state["history"]] == ["order 2 of 1"]
+    assert state["event"] == "buyer went back to decision 2, day 1."
+    host.handle("buyer", {"do": "redo"})
+    assert [row["words"] for row in settle(host)["history"]] == ["order 2 of 1", "order 1 of 1"]
+
+
+def test_values_labels_and_charts_are_those_of_one_decision(make_host):
+    many = replace(
+        ORDER,
+        observation_space=spaces.Box(-np.inf, np.inf, (20,)),
+        observation_space_mapping=lambda shop: [shop.day + place for place in range(20)],
+        observation_labels=[f"value {place}" for place in range(20)],
+    )
+
+    class Wide(Shop):
+        points = {Shop.order: many}  # noqa: RUF012
+
+    host = make_host(Wide)
+    state = play(host, [1, 1])
+    for place, entry in enumerate(state["views"]["buyer"]["situation"]):
+        assert entry["label"] == f"value {place}"
+        assert entry["past"] == [place, place + 1, place + 2]
+
+
+def test_a_display_is_shown_in_place_of_the_observation(make_host):
+    shown = replace(
+        ORDER, question="How much?", display_mapping=lambda shop: {"day": f"{shop.day} d"}
+    )
+
+    class Shown(Shop):
+        points = {Shop.order: shown}  # noqa: RUF012
+
+    host = make_host(Shown)
+    pending = play(host, [1])["pending"]
+    assert (pending["question"], pending["situation"]) == (
+        "How much?",
+        [{"label": "day", "text": "1 d", "number": 1.0}],
+    )
+    assert think(host)["measures"] == ["your points", "day"]
+
+
+def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
+    host = make_host()
+    settle(host)
+    fan = think(host)
+    assert (fan["by_time"], fan["horizon"], fan["done"]) == (True, 8.0, True)
+    host.handle("buyer", {"do": "horizon", "n": 3, "by": "time"})
+    assert think(host)["horizon"] == 3
+
+    class Slow(Shop):
+        def switch(self):
+            time.sleep(3)
+            return super().switch()
+
+    slow = make_host(Slow)
+    settle(slow)
+    time.sleep(0.5)  # its first future computes
+    begin = time.monotonic()
+    slow.exploring.abandon()
+    assert time.monotonic() - begin < 2
+
+
+def test_a_restart_can_be_taken_back(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    host = make_host(record=path)
+    before = play(host, [1, 3])
+    host.handle("buyer", {"do": "restart", "n": None})
+    state = settle(host)
+    assert (state["turn"], state["back"]) == (0, True)
+    assert state["event"].startswith("buyer began another game")
+    host.handle("buyer", {"do": "redo"})
+    assert settle(host) | {"moment": 0, "event": ""} == before | {"moment": 0}
+    play(host, [2])
+    assert [len(each.decisions) for each in read(path)] == [6]
+
+
+def test_a_recording_is_resumed_where_it_stood(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
+    play(host, [1, 3, 2])
+    host.handle("buyer", {"do": "undo"})
+    before = settle(host)
+    with path.open("a") as file:
+        file.write('{"turn": 3, "agent": "bu')  # a crash
+    again = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
+    moments = {"moment": 0, "event": ""}
+    assert settle(again) | moments == before | moments
+    assert {row["by"] for row in before["history"]} == {"person", "policy"}
+    play(again, [0])
+    assert [line["words"] for line in read(path)[-1].decisions if line["by"] == "person"] == [
+        "1", "3", "0",
+    ]  # fmt: skip
+    assert replay(path, Shop)["seller"].actions.tolist() == [[0, 1]] * 3
+    with pytest.raises(OptionValueError, match="its skip_forced is None, not True"):
+        make_host(record=path, options={"skip_forced": True})
+    with pytest.raises(OptionValueError, match="does not repeat"):
+        make_host(BreakingShop, record=path)
+    assert settle(make_host(record=path, new=True))["turn"] == 0
+    assert len(read(path)) == 2
+
+
+def test_a_failed_write_is_made_up_for(make_host, tmp_path, monkeypatch):
+    path = tmp_path / "game.jsonl"
+    host = make_host(record=path)
+    path.rename(tmp_path / "kept")
+    path.mkdir()
+    play(host, [1])
+    path.rmdir()
+    (tmp_path / "kept").rename(path)
+    path.write_text(path.read_text()[:-1])  # without the end of its line
+    play(host, [2])
+    assert [line["turn"] for line in read(path)[0].decisions] == [0, 1, 2, 3]
+
+
+def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
+    class Closing(Shop):
+        def run(self):
+            self.days = 3
+            super().run()
+            self.end_agent("seller")
+            for self.day in range(3, 6):
+                self.order()
+
+    host = make_host(Closing, seats=())
+    states = []
+    while not host.game.over:
+        states.append(settle(host))
+        action = 1 if host.game.now["agent"] == "buyer" else [1, 1]
+        host.game.decide(action, "person")
+    states.append(settle(host))
+    turns = [*range(len(states))]
+    random.Random(1).shuffle(turns)
+    for turn in turns * 2:
+        host.handle("buyer", {"do": "jump", "n": turn})
+        state = settle(host)
+        assert (state["turn"], state["returns"]) == (turn, states[turn]["returns"])
+
+
+def test_a_policy_decides_in_its_seat_and_its_errors_are_told(make_host):
+    async def policy(observation, *, _decision):
+        assert not _decision.in_clone
+        return [1, 2]
+
+    def broken(observation):
+        raise KeyError("seller")
+
+    host = make_host(seats=(), policies={"seller": policy})
+    state = play(host, [1])
+    assert state["policies"]["seller"].endswith("policy")
+    assert [(row["agent"], row["by"], row["action"]) for row in state["history"]] == [
+        ("buyer", "person", 1),
+        ("seller", "policy", [1, 2]),
+    ]
+    host.handle("buyer", {"do": "undo"})  # in a clone, the policy is asked as in the game
+    assert play(host, [2])["history"][1]["action"] == [1, 2]
+    assert (
+        "the policy of seller has failed"
+        in play(make_host(policies={"seller": broken}), [1])["ending"]
+    )
+    assert "illegally" in play(make_host(policies={"seller": lambda _: [5, 5]}), [1])["ending"]
+
+
+def test_joint_and_turn_policies_decide_in_seats(make_host):
+    env = simenv_marl.joint_env(Shop)
+    both = joint_policy(lambda observation: {"buyer": 2, "seller": [0, 1]}, like=env)
+    host = make_host(seats=("buyer",), policies=both)
+    history = play(host, [1, 3])["history"]
+    assert [row["action"] for row in history] == [1, [0, 1], 3, [0, 1]]
+
+
+def test_the_end_is_told_in_words_and_compared_with_the_rule(make_host):
+    host = make_host(options={"max_steps": 6})
+    state = play(host, [1, 3, 0])
+    assert (state["over"], state["ending"]) == ("truncated", "Time is up.")
+    compared = think(host)
+    plain = make_host(options={"max_steps": 6})
+    rule = play(plain, [None] * 0)
+    while not plain.game.over:
+        plain.game.decide(None, "rule")
+    assert compared["type"] == "rule"
+    assert compared["totals"]["buyer"] == plain.game.returns["buyer"]
+    assert len(state["courses"]["buyer"]) == len(compared["courses"]["buyer"]) == 4
+    assert rule["turn"] == 0
+    host.handle("buyer", {"do": "again"})
+    assert settle(host)["turn"] == 0
+
+
+def test_only_who_has_the_tools_can_use_them(make_host):
+    host = make_host(tools="facilitator")
+    play(host, [1])
+    with pytest.raises(InvalidActionError, match="facilitator"):
+        host.handle("buyer", {"do": "undo"})
+    host.handle("", {"do": "undo"})
+    assert settle(host)["event"] == "The facilitator went back to decision 1, time 0."
+    with pytest.raises(OptionValueError, match="tools"):
+        make_host(tools="nurse")
+
+
+def test_a_click_that_is_late_changes_nothing(make_host):
+    host = make_host()
+    state = play(host, [1, 2])
+    for _ in range(2):
+        host.handle("buyer", {"do": "undo", "moment": state["moment"]})
+    assert settle(host)["turn"] == 2
+
+
+def test_numbers_that_json_lacks_never_leave_the_game(make_host):
+    class Wild(Shop):
+        points = {  # noqa: RUF012
+            Shop.order: replace(
+                ORDER,
+                observation_space=spaces.Box(-np.inf, np.inf, (2,)),
+                observation_space_mapping=lambda shop: [np.inf, np.nan],
+                display_mapping=None,
+            )
+        }
+
+    host = make_host(Wild)
+    play(host, [1])
+    host.exploring.wait()
+    for message in [settle(host), *(each for _, each in host.sent)]:
+        json.dumps(jsonable(message), allow_nan=False)
+    assert think(host)["measures"] == ["your points"]
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "text"),
+    [
+        (spaces.Box(0.0, 1.0, (1,)), [7], "Enter a number from 0 to 1, not 7."),
+        (spaces.Box(0, 5, (2,), int), [2, 0.5], "Enter a whole number from 0 to 5, not 0.5."),
+        (
+            spaces.Box(0.0, np.inf, (1,)),
+            ["Infinity"],
+            "Enter a number of at least 0, not 'Infinity'.",
+        ),
+        (spaces.Discrete(3), 9, "Choose one of these answers: 0, 1, 2 (not 9)."),
+        (spaces.MultiDiscrete([2, 2]), [0, 4], "Choose one of 0, 1, not 4."),
+        (spaces.Dict({"a": spaces.Discrete(2)}), {"a": 3}, "Choose one of 0, 1, not 3."),
+        (spaces.Text(3), "four", "Enter at most 3 characters, not 'four'."),
+    ],
+)
+def test_what_is_wrong_with_an_action_is_said_in_its_words(space, action, text):
+    form = form_of(space, None, None)
+    assert complaint_about(form, action)["text"] == text
+    legal = jsonable(space.sample())
+    assert complaint_about(form, legal) == {} or "cards" in form
+    assert words_of(form, legal)
+
+
+def test_masked_actions_are_hidden_and_values_have_four_digits():
+    form = form_of(spaces.Discrete(4), np.array([1, 0, 1, 0], np.int8), {0: "no", 2: "two"})
+    assert form == {"cards": [{"action": 0, "text": "no"}, {"action": 2, "text": "two"}]}
+    texts = [shown(value) for value in (1 / 3, 1234.56, 123456.7, 1e-7, 12, True, np.float32(0.1))]
+    assert texts == ["0.3333", "1235", "123457", "1e-07", "12", "yes", "0.1"]

@@ -41,23 +41,29 @@ class Server:
             "simenv_marl",
             "play",
             simulation,
-            "--port",
-            "0",
+            *(() if "--port" in arguments else ("--port", "0")),
             *arguments,
         ]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env=environment, cwd=ROOT, start_new_session=True,
         )  # fmt: skip
-        self.base = re.search(r"http://\S+", self.process.stdout.readline())[0]
+        line = self.process.stdout.readline()
+        self.resumed = "goes on" in line
+        if self.resumed:
+            line = self.process.stdout.readline()
+        self.base = re.search(r"http://\S+", line)[0]
         self.host = self.base.split("/")[2]
-        self.links = {}
+        self.links, self.facilitator = {}, ""
 
     def keys(self, *seats):
         while not self.links.keys() >= set(seats):
             link = self.process.stdout.readline().strip()
-            seat, key = re.search(r"/seat/(\w+)\?key=(\w+)$", link).groups()
-            self.links[seat] = key
+            if "/facilitator" in link:
+                self.facilitator = link.removeprefix(self.base)
+            else:
+                seat, key = re.search(r"/seat/(\S+)\?key=(\w+)$", link).groups()
+                self.links[seat] = key
         return [self.links[seat] for seat in seats]
 
     def page(self, seat="", key="", **options):

@@ -52,8 +52,7 @@ def make_host():
 
     yield make
     for host in hosts:
-        if host.exploring:
-            host.exploring.abandon()
+        host.abandon()
         host.game.close()
 
 
@@ -156,6 +155,8 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_host, forks, mo
         host.handle("buyer", {"do": "jump", "n": turn})
         assert host.game.turn == turn
         assert settle(host)["length"] == 8
+    host.abandon()
+    host.abandon()
     host.game.jump(7)  # of the seller: nobody plays it
     assert host.game.turn == 6
     for do, turn in (("undo", 4), ("redo", 6), ("redo", 8), ("redo", 8)):
@@ -163,8 +164,10 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_host, forks, mo
         assert host.game.turn == turn
     assert json.dumps(host.game.timeline) == before
     old = host.game.env
+    host.abandon()
     host.game.jump(4)
     assert old is host.game.root or not old.agents
+    host.abandon()
     host.game.decide(2, "person")
     assert max(host.game.checkpoints, default=0) <= 4
     state = play(host, [2, 1, 1, 0, 2])
@@ -292,11 +295,13 @@ def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_host):
     host.handle("seller", {"do": "skip"})
     state = settle(host)
     assert (state["turn"], state["pending"]["agent"]) == (1, "seller")  # it is its turn
+    host.abandon()
     host.game.decide([0, 0], "person")
     host.handle(None, {"taken": ["seller"]})
     host.handle("seller", {"do": "skip"})
     state = settle(host)
     assert (state["turn"], state["pending"]["agent"]) == (3, "seller")
+    host.abandon()
     host.game.decide([0, 0], "person")
     assert settle(host)["pending"]["agent"] == "buyer"  # the skip ended at the seller's turn
 
@@ -342,12 +347,15 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_host, 
     host = make_host(seats=(), record=tmp_path / "game.jsonl")
     for _ in range(3):
         settle(host)
+        host.abandon()
         host.game.decide(3 if host.game.now["agent"] == "buyer" else [0, 2], "person")
     host.handle("buyer", {"do": "undo"})
     for seat in ("buyer", "seller"):
         host.delegated[seat] = 100
     settle(host)
-    host.game.decide(0, "person") if host.game.now and host.game.now["agent"] == "buyer" else None
+    if host.game.now and host.game.now["agent"] == "buyer":
+        host.abandon()
+        host.game.decide(0, "person")
     state = settle(host)
     assert state["over"]
     found = replay(tmp_path / "game.jsonl", Shop)
@@ -369,6 +377,7 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ho
     host = make_host(record=path)
     assert json.loads(path.read_text()) == {"simulation": "shop", "seed": 5, "seats": ["buyer"]}
     play(host, [2] * 8)
+    host.abandon()
     host.game.restart(6)
     play(host, [1])
     assert replay(path, Shop)["buyer"].seeds == (6,)
@@ -550,6 +559,7 @@ def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
     while not host.game.over:
         states.append(settle(host))
         action = 1 if host.game.now["agent"] == "buyer" else [1, 1]
+        host.abandon()
         host.game.decide(action, "person")
     states.append(settle(host))
     turns = [*range(len(states))]

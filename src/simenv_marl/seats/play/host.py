@@ -152,7 +152,7 @@ class Host:
         with suppress(EOFError):
             while True:
                 self._work_until_changed(connection)
-        self._abandon()
+        self.abandon()
         self.game.close()
 
     def _work_until_changed(self, connection: Connection) -> None:
@@ -172,7 +172,7 @@ class Host:
         """
         if self.game.now is not None and self._seconds_left() == 0.0:
             self._tell({"type": "busy", "on": True})
-            self._abandon()
+            self.abandon()
             self.game.decide(None, "limit")
             return True
         if not connection.poll(timeout):
@@ -253,7 +253,7 @@ class Host:
                 by_time = message.get("by") == "time"
                 if not by_time and length > 100:
                     raise OptionValueError("Enter a whole number of decisions from 1 to 100.")
-                self._abandon()
+                self.abandon()
                 self._horizon.set(by_time, length)
                 self._moment = -1
             case _:
@@ -263,7 +263,7 @@ class Host:
     def _decide(self, action: Any, by: str) -> None:
         if action is not None:
             at_decision(self.game.env, "play", Legal(action))
-        self._abandon()
+        self.abandon()
         self.game.decide(action, by)
         self.event = ""
 
@@ -276,7 +276,7 @@ class Host:
         futures = self.exploring
         if isinstance(futures, Futures):
             at_decision(self.game.env, "play", Legal(action))
-            self._abandon()
+            self.abandon()
             self.exploring = futures.resumed(futures.env)
             self.exploring.add(action)
 
@@ -284,7 +284,7 @@ class Host:
         game = self.game
         end = len(game.timeline)
         if game.previous is not None and not any("action" in row for row in game.timeline):
-            self._abandon()
+            self.abandon()
             game.go_back()
             self._stop_rule()
             self.event = f"{_called(seat)} went back to the game before the restart."
@@ -295,7 +295,7 @@ class Host:
     def _jump(self, turn: int, seat: str) -> None:
         game = self.game
         before = game.turn
-        self._abandon()
+        self.abandon()
         game.jump(turn)
         self._stop_rule()
         if game.turn != before:
@@ -331,7 +331,7 @@ class Host:
             raise OptionValueError(
                 f"Enter a whole number from 0 to {2**31 - 1}, or none for a random one."
             )
-        self._abandon()
+        self.abandon()
         self.game.restart(seed)
         self._stop_rule()
         self.event = f"{_called(seat)} began another game, with seed {seed}."
@@ -382,14 +382,14 @@ class Host:
         game = self.game
         latest = monotonic()
         while game.now is not None and self._leaves_to_rule(game.now["agent"]):
-            self._abandon()
+            self.abandon()
             game.answer()
             yield None
             if monotonic() > latest + PAUSE:
                 latest = monotonic()
                 yield self.snapshot()
         if game.moment != self._moment:
-            self._abandon()
+            self.abandon()
             self._moment = game.moment
             self._picture = None
             if game.now is not None:
@@ -425,7 +425,7 @@ class Host:
             env.reset(seed=game.seed)
         return Comparison(env, game.deciders, returns, game.moment)
 
-    def _abandon(self) -> None:
+    def abandon(self) -> None:
         """End the exploration, before the game changes."""
         if self.exploring is not None:
             self.exploring.abandon()

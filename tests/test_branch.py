@@ -432,7 +432,8 @@ def test_what_cannot_be_forked_is_replayed_or_named(held, name):
 @pytest.mark.parametrize("held", [mapped("r"), mapped("c"), a_semaphore])
 def test_memory_that_no_process_can_change_is_forked(held):
     env = held_by(type("Model", (Holding,), {"open": held}))
-    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
+    with anonymous_memory(None):  # which the simulation does not hold
+        assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
 
 
 def test_memory_that_was_shared_before_the_import_does_not_count():

@@ -6,6 +6,7 @@ simulation runs in an environment, it asks the environment for its decision. One
 decision point, its hook, with any number of definitions.
 """
 
+from collections import Counter
 from collections.abc import (
     Callable,
     Collection,
@@ -14,8 +15,8 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
-from dataclasses import dataclass
-from functools import update_wrapper
+from dataclasses import dataclass, fields, is_dataclass
+from functools import partial, update_wrapper
 from types import FunctionType
 from typing import Any, Final
 
@@ -82,7 +83,7 @@ class Definition:
         """
         for problem in _problems(self):
             raise DefinitionError(f"make_step: {problem}")
-        decisions = _decisions(self.action_space_mapping)
+        decisions = decisions_by_action(self.action_space_mapping)
         if decisions is not None:
             object.__setattr__(self, "action_space_mapping", dict(decisions).__getitem__)
         names: Any = self.removed_by
@@ -207,8 +208,9 @@ def make_step(
         action_labels: The texts that people and language models read instead of numbers: for a
             ``Discrete`` a sequence of texts, or a dict from action to text; for a space with one
             dimension a sequence, with a text for each component; for a ``Dict`` a dict; or a
-            callable of the call's arguments that returns one of these. Default: choices and
-            decisions as text, else numbers.
+            callable of the call's arguments that returns one of these. All texts differ. Default:
+            choices and decisions as text, else numbers; equal ones are followed by the number of
+            their action.
         observation_labels: The same for the parts of observations.
         question: The question that people and language models answer, or a callable of the call's
             arguments that returns it. Default: "By its rule: " and the first sentence of the
@@ -267,7 +269,7 @@ def _problems(definition: Definition) -> Iterator[str]:
     missing = [name for name in _GOAL if getattr(definition, name) is None]
     if 0 < len(missing) < len(_GOAL):
         yield f"a goal needs all of its parts; missing: {', '.join(missing)}"
-    decisions = _decisions(definition.action_space_mapping)
+    decisions = decisions_by_action(definition.action_space_mapping)
     if decisions is None:
         return
     if not isinstance(space, spaces.Discrete):
@@ -289,8 +291,8 @@ def _required_kind(
     """Return the kind of value that a part must be; None if the part is of this kind."""
     if name.endswith("_space"):
         return None if isinstance(part, spaces.Space) else "a gymnasium space"
-    if callable(part):
-        return None
+    if callable(part) and not (name.endswith("_labels") and isinstance(part, Iterable)):
+        return None  # an Enum is callable, too, but does not return labels
     if name in ("agent", "question"):
         return None if isinstance(part, str) and part else "a text or a callable"
     if name in ("action_space_mapping", "rule_action_mapping"):
@@ -298,7 +300,9 @@ def _required_kind(
     if name.endswith("_labels"):
         space = getattr(definition, name.removesuffix("_labels") + "_space")
         fits = texts_of(space, part) is not None
-        return None if fits else f"texts for the parts of {short_repr(space)}, or a callable"
+        if fits:
+            return None
+        return f"texts for the parts of {short_repr(space)}, all of them different, or a callable"
     return "callable"
 
 
@@ -322,17 +326,56 @@ def texts_of(space: Space, labels: object, *, all_parts: bool = True) -> dict[An
         labels = dict(zip(parts, labels, strict=False)) if len(labels) == len(parts) else None
     if not isinstance(labels, Mapping):
         return None
-    texts: Collection[str] = [text for text in labels.values() if isinstance(text, str)]
-    least = len(parts)
-    if not isinstance(space, spaces.Discrete):
-        texts = set(texts)  # they distinguish the parts of arrays and dicts
-    elif not all_parts:
-        least = 0
+    texts = {text for text in labels.values() if isinstance(text, str) and text.strip()}
+    may_leave_out = isinstance(space, spaces.Discrete) and not all_parts
+    least = 0 if may_leave_out else len(parts)
     fits = least <= len(labels) == len(texts) and labels.keys() <= set(parts)
     return dict(labels) if fits else None
 
 
-def _decisions(mapping: object) -> Mapping[Any, Any] | None:
+def completed(labels: Mapping[Any, str], defaults: Mapping[Any, str]) -> dict[Any, str]:
+    """Return the labels of the parts that have a default, which stands where there is no label.
+
+    Defaults that are equal to other labels are followed by the number of the part.
+    """
+    texts = {part: labels.get(part, default) for part, default in defaults.items()}
+    while True:
+        counts = Counter(texts.values())
+        equal = {part for part, text in texts.items() if counts[text] > 1}
+        if equal <= labels.keys():
+            return texts
+        texts |= {part: f"{texts[part]} ({part})" for part in equal - labels.keys()}
+
+
+def label_of(value: object, *, quoted: bool = False) -> str:
+    """Return a decision or a choice as text: numbers without types, and records by their fields.
+
+    ``quoted``: whether a text is quoted, because it is a part of another value.
+    """
+    kind = type(value)
+    if kind.__str__ is not object.__str__:
+        text = str(value)
+        is_text = isinstance(value, str)
+        return repr(text) if is_text and (quoted or not text.strip()) else text
+    part_of = partial(label_of, quoted=True)
+    names = getattr(kind, "_fields", ())
+    if is_dataclass(value) and hasattr(kind.__repr__, "__wrapped__"):  # not one of the user's
+        names = [field.name for field in fields(value) if field.repr]
+    if names:
+        parts = [f"{name}={part_of(getattr(value, name))}" for name in names]
+        return f"{kind.__name__}({', '.join(parts)})"
+    if isinstance(value, dict):
+        parts = [f"{part_of(key)}: {part_of(item)}" for key, item in value.items()]
+        return f"{{{', '.join(parts)}}}"
+    if isinstance(value, (list, tuple)):
+        text = ", ".join(map(part_of, value))
+        if isinstance(value, list):
+            return f"[{text}]"
+        return f"({text},)" if len(value) == 1 else f"({text})"
+    return kind.__name__ if kind.__repr__ is object.__repr__ else str(value)
+
+
+def decisions_by_action(mapping: object) -> Mapping[Any, Any] | None:
     """Return the dict from action to decision that an ``action_space_mapping`` was made of.
 
     None for a callable.
@@ -346,7 +389,7 @@ def _decisions(mapping: object) -> Mapping[Any, Any] | None:
 
 def inverse(definition: Definition) -> dict[Any, Any] | None:
     """Return the dict from decision to action; None without an invertible dict of decisions."""
-    decisions = _decisions(definition.action_space_mapping) or {}
+    decisions = decisions_by_action(definition.action_space_mapping) or {}
     try:
         actions = {decision: action for action, decision in decisions.items()}
     except TypeError:  # unhashable decisions

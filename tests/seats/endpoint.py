@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
-def says(text, **message):
+def says(text, finish="stop", **message):
     """Return the body of a completion that says something."""
     return {
         "id": "1",
@@ -17,7 +17,7 @@ def says(text, **message):
         "choices": [
             {
                 "index": 0,
-                "finish_reason": "stop",
+                "finish_reason": finish,
                 "message": {"role": "assistant", "content": text, **message},
             }
         ],
@@ -36,6 +36,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self):
         request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         request["key"] = self.headers.get("Authorization")
+        request["port"] = self.client_address[1]
         self.server.requests.append(request)
         answer = (
             self.server.answers.pop(0) if len(self.server.answers) > 1 else self.server.answers[0]

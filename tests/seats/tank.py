@@ -63,9 +63,9 @@ DRAIN = filling(spaces.Discrete(2), {0: 0.5, 1: 1.5}, agent="drainer")
 POINTS = {Tank.fill: FILL, Tank.drain: DRAIN}
 
 
-def played(policy, seed=3, points=POINTS, **options):
+def played(policy, seed=3, points=POINTS, simulation=Tank, **options):
     """Return the levels of an episode in which a policy fills the tank."""
-    return simulate(Tank, {"filler": policy}, points=points, seed=seed, **options).log
+    return simulate(simulation, {"filler": policy}, points=points, seed=seed, **options).log
 
 
 def log_of(tank):

@@ -1,7 +1,10 @@
 """Pending decisions as text and as JSON, and texts as actions, by the labels of the model."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import Enum
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -35,8 +38,8 @@ def test_a_pending_decision_is_described_in_words():
     assert describe(env).splitlines() == [
         "filler decides (decision 2, time 1).",
         "Observation:",
-        f"- level: {env.observe('filler')[0]:.6g}",
-        f"Reward of the previous action: {env.unwrapped.simulation.level:.6g}",
+        f"- level: {env.observe('filler')[0]!s}",
+        f"Reward of the previous action: {env.unwrapped.simulation.level!r}",
         "Legal actions:",
         "- closed",
         "- half",
@@ -85,6 +88,7 @@ def test_what_a_policy_gets_is_described_as_the_environment_is():
     assert said[0] == describe(env_of())
 
 
+# By labels, of which those in brackets are masked: texts, and the numbers of the actions they name.
 SAID = {
     ("closed", "half", "open"): {
         **dict.fromkeys(
@@ -94,70 +98,154 @@ SAID = {
             ["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"]
         ),
     },
-    ("1", "2", "3"): {
-        "1": 0,
-        "2": 1,
-        '{"action": "3"}': 2,
-        '{"action": 2.0}': 1,
-        "0": 0,
-        "4": None,
-    },
+    ("1", "2", "3"): {"1": 0, "2": 1, '{"action": "3"}': 2, '{"action": 2.0}': 1, "0": None},
     ("R", "R'", "U"): {"R'": 1},
-    ("bxc3", "Bxc3", "a"): {"bxc3": 0, "Bxc3": 1},
+    ("bxc3", "Bxc3", "a"): {"bxc3": 0, "Bxc3": 1, "I play Bxc3.": None},
     (" open", "shut", "ajar"): {" open": 0},
     ("1.5", "2", "3"): {"1.50": 0},
     ("open", "half open", "shut"): {
         "I choose half open; half open is safe.": 1,
-        "<think>shut or open?</think> open": None,
+        "half\nopen": 1,
+        "half-open": None,
         '```json\n{"action": "shut"}\n```': 2,
         'Perhaps {"action": "open"}, or rather {"action": "shut"}.': 2,
     },
     ("OPEN", "open", "shut"): {"Open": None},
+    # What is said in JSON is not searched as text.
+    ("buy", "sell", "hold"): {
+        '{"action": "buy", "reason": "to hold would not pay"}': 0,
+        '{"reason": "to hold would not pay", "Action": "BUY", "sure": true}': 0,
+        'I hold it wise: ```json\n{"action": "sell", "of": {"buy": 1}}\n``` and hold.': 1,
+        '{"move": "sell", "why": "to hold is bad"}': 1,
+        '{"action": ...} means {"action": "hold"}': 2,
+        **dict.fromkeys(
+            [
+                '{"action": "I hold"}',
+                '{"action": "none", "instead": "buy"}',
+                '{"move": "sell", "or": "buy"}',
+                '{"action": "buy", "action": "sell"}',
+                '{"reason": "to hold would be',  # it was cut off
+                '{"rejected": {"action": "buy"}, "act',
+                '["buy"]',
+                "[" * 99999,
+                '{"a":' * 99999,
+            ]
+        ),
+    },
+    # Reasoning is not an answer.
+    ("up", "down", "stay"): {
+        "<think>up or down?</think> stay": 2,
+        '<THINKING>{"action": "up"}</THINKING>\n{"action": "down"}': 1,
+        "up or down?</think>down": 1,
+        "[THINK]up[/THINK]**Stay**": 2,
+        "<think>up or down? up": None,
+        "<think></think>": None,
+    },
+    # A text says one label as a whole word, and does not deny it.
+    ("wait", "[wait for truck]", "go"): {
+        "I wait.": 0,
+        "_Go_!": 2,
+        **dict.fromkeys(
+            [
+                *["wait for truck", "Wait for\ntruck!", "1", '{"action": "wait for truck"}'],
+                *["go, not wait", "go/wait", "waiting", "go-around", "I do not go", "Don't wait!"],
+                *["go rather than wait for truck", "go\u2014not wait for truck"],
+            ]
+        ),
+    },
+    ("buy it", "[sell]", "hold"): {"sell, not buy it": None, "sell": None, "HOLD": 2},
+    # Signs and digits have many forms.
+    ("-2", "2", "x"): {
+        **dict.fromkeys(
+            ["-2", "\u22122", "- 2", "\u2013 2", "\uff0d\uff12", '{"action": "- 2"}'], 0
+        ),
+        **dict.fromkeys(["I say \u22122!", "answer: - 2", "-2.0", '{"action": -2}'], 0),
+        **dict.fromkeys(["2", "\uff12", "+2", '{"action": 2}', "2 of 7"], 1),
+        **dict.fromkeys(["1-2", "1", "2.5", ".2", "x-2", "2, x", "0"]),
+    },
+    ("10", "\u221220", "30"): {"-20": 1, "1": None, '{"action": 2}': None, "30.0": 2},
 }
 
 
 @pytest.mark.parametrize(
     ("labels", "said"), [(labels, said) for labels in SAID for said in SAID[labels]]
 )
-def test_an_action_is_named_by_label_or_value_or_an_error_lists_the_legal_ones(labels, said):
-    env = env_of(replace(FILL, action_labels=dict(enumerate(labels))))
-    if SAID[labels][said] is None:
-        legal = "\n".join(f"- {label}" for label in labels)
-        with pytest.raises(InvalidActionError, match=f"'filler'; these are legal:\n{legal}"):
+def test_a_text_names_one_legal_action_or_an_error_lists_them(labels, said):
+    mask = [not label.startswith("[") for label in labels]
+    texts = [label.strip("[]") for label in labels]
+    env = env_of(
+        replace(FILL, action_labels=texts, action_mask_mapping=lambda tank: np.array(mask, np.int8))
+    )
+    action = SAID[labels][said]
+    if action is None:
+        legal = "\n".join(f"- {text}" for text in compress(texts, mask))
+        with pytest.raises(InvalidActionError, match=f"'filler'; these are legal:\n{legal}$"):
             parse(env, said)
     else:
-        assert parse(env, said) == SAID[labels][said]
+        assert parse(env, said) == action
 
 
-def test_masked_actions_are_neither_listed_nor_taken():
-    env = env_of(
-        replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1])
-    )
-    with pytest.raises(InvalidActionError):
-        parse(env, "2")
+def test_masked_actions_are_not_listed():
     env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
     assert "half" not in describe(env)
     assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["closed", "open"]}
-    for text in ("half", "1"):  # which are not taken for another action
-        with pytest.raises(InvalidActionError, match=r"legal:\n- closed\n- open$"):
-            parse(env, text)
 
 
-def test_choices_and_decisions_are_labels_where_none_are_given():
-    decisions = replace(FILL, action_labels=None)
-    assert describe(env_of(decisions), as_json=True)["actions"] == {
-        "type": "string",
-        "enum": ["0.0", "1.0", "2.0"],
-    }
-    moves = replace(
-        decisions, action_space_mapping=None, choices=lambda tank: [3.0, 4.0, 4.0][: 3 - tank.day]
+class Valve(Enum):
+    CLOSED = 0
+    HALF = 1
+    OPEN = 2
+
+
+class Move(NamedTuple):
+    piece: str
+    hours: float
+
+
+@dataclass
+class Job:
+    number: int
+    start: float
+
+
+class Plain:
+    pass
+
+
+CHOICES = {
+    "numbers": ([np.float64(8.0), np.int64(3), np.float32(0.1)], ["8.0", "3", "0.1"]),
+    "records": (
+        [Move("rook", np.float64(8.0)), Job(2, np.float32(0.1)), Valve.OPEN],
+        ["Move(piece='rook', hours=8.0)", "Job(number=2, start=0.1)", "Valve.OPEN"],
+    ),
+    "containers": (
+        [(np.int64(1), "a"), [np.float64(0.5)], {"x": np.float64(2.0)}],
+        ["(1, 'a')", "[0.5]", "{'x': 2.0}"],
+    ),
+    "equal": ([Plain(), Plain(), "Plain (1)"], ["Plain (0)", "Plain (1) (1)", "Plain (1) (2)"]),
+    "like numbers of actions": (["2", "2"], ["2 (0)", "2 (1)"]),
+    "blank": (["", " "], ["''", "' '"]),
+}
+
+
+@pytest.mark.parametrize("kind", CHOICES)
+def test_choices_are_labelled_exactly_and_each_in_another_way(kind):
+    choices, labels = CHOICES[kind]
+    env = env_of(
+        replace(FILL, action_labels=None, action_space_mapping=None, choices=lambda tank: choices)
     )
-    env = env_of(moves)
-    assert describe(env, as_json=True)["actions"] == {
-        "type": "string",
-        "enum": ["3.0", "4.0 (1)", "4.0 (2)"],
-    }
-    assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
+    assert describe(env, as_json=True)["actions"]["enum"] == labels
+    assert [parse(env, label) for label in labels] == list(range(len(labels)))
+
+
+@pytest.mark.parametrize(("labels", "decisions", "enum"), [
+    (None, {0: 0.0, 1: 1.0, 2: 2.0}, ["0.0", "1.0", "2.0"]),
+    (None, {0: "no", 1: [2], 2: "no"}, ["no (0)", "[2]", "no (2)"]),
+    (lambda tank: {0: "1"}, str, ["1", "1 (1)", "2"]),
+])  # fmt: skip
+def test_actions_without_a_label_have_their_decision_or_number(labels, decisions, enum):
+    env = env_of(replace(FILL, action_labels=labels, action_space_mapping=decisions))
+    assert describe(env, as_json=True)["actions"]["enum"] == enum
 
 
 def test_labels_may_be_made_for_each_call():
@@ -167,7 +255,7 @@ def test_labels_may_be_made_for_each_call():
         )
     )
     assert parse(env, "2 of 5.0") == 2
-    for labels in (["one"], {1: "one", 2: "two", 3: "three"}):
+    for labels in (["one"], {1: "one", 2: "two", 3: "three"}, ["one", "two", "one"]):
         bad = env_of(replace(FILL, action_labels=lambda tank, labels=labels: labels))
         with pytest.raises(
             DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"
@@ -176,26 +264,43 @@ def test_labels_may_be_made_for_each_call():
 
 
 SPACES = {
-    "number": (spaces.Box(0, 2, (1,)), None, ["1.5", "[1.5]", '{"action": 1.5}'], [1.5]),
+    "number": (
+        spaces.Box(0, 2, (1,)),
+        None,
+        ["1.5", "[1.5]", '{"action": 1.5}', '{"valve": 1.5}', "\uff11.5"],
+        [1.5],
+    ),
     "numbers": (
         spaces.Box(0, 2, (2,)),
         ["in", "out"],
-        ['{"in": 1, "out": 0.5}', "[1, 0.5]", "1, 0.5"],
+        ['{"in": 1, "out": 0.5, "why": "in"}', "[1, 0.5]", "1, 0.5", '["+1", "0.5"]'],
         [1, 0.5],
+    ),
+    "below": (
+        spaces.Box(-9, 0, (2,)),
+        None,
+        ["\u22122, - 3", '{"0": "\u2212 2", "1": -3}', "```\n[-2, -3]\n```"],
+        [-2, -3],
     ),
     "counts": (spaces.MultiDiscrete([3, 4]), ["a", "b"], ['{"a": 2, "b": 3}', "[2, 3]"], [2, 3]),
     "switches": (spaces.MultiBinary(2), None, ["[1, 0]", '{"0": 1, "1": 0}'], [1, 0]),
     "parts": (
         spaces.Dict({"kind": spaces.Discrete(3), "size": spaces.Box(0, 9, (1,))}),
         {"kind": "Kind", "size": "Size in m"},
-        ['{"Kind": 2, "Size in m": 4}', '{"kind": 2, "size": 4}'],
+        ['{"Kind": 2, "Size in m": 4}', '{"action": {"kind": 2, "size": 4}, "why": "kind 1"}'],
         {"kind": 2, "size": [4]},
     ),
     "pair": (
         spaces.Tuple([spaces.Discrete(3), spaces.Discrete(2)]),
         None,
-        ["[2, 1]", '{"0": 2, "1": 1}'],
+        ["[2, 1]", '{"0": 2, "1": 1}', "2 1"],
         (2, 1),
+    ),
+    "text": (
+        spaces.Text(4, charset="abc "),
+        None,
+        ["ab", " ab\n", '"ab"', '{"action": "ab", "why": "c"}', "<think>c</think>```\nab\n```"],
+        "ab",
     ),
 }
 
@@ -208,7 +313,7 @@ def test_actions_of_other_spaces_are_said_as_json_and_wrong_components_are_illeg
         found = parse(env, text)
         assert space.contains(found)
         np.testing.assert_equal(found, action)
-    for text in ("[9, 9, 9]", '{"valve": 1}', "many", "[77, 77]", "{}"):
+    for text in ("[9, 9, 9]", '{"valve": 77}', "many", "[77, 77]", "{}", "abcab"):
         with pytest.raises(InvalidActionError, match="these are legal"):
             parse(env, text)
     for name in labels or ():
@@ -240,6 +345,12 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
     assert describe(env_of(filling(amount, action_labels=["litres"]))).endswith(
         "\n- litres: a number from 0 to 2"
     )
+    assert schema(spaces.Text(3, min_length=2, charset="a-]b")) == {
+        "type": "string",
+        "minLength": 2,
+        "maxLength": 3,
+        "pattern": r"^[\-\]ab]*$",
+    }
     with pytest.raises(ViewError, match="cannot be put into words"):
         schema(spaces.Box(0, 1, (2, 2)))
 
@@ -259,6 +370,20 @@ def test_parts_of_an_observation_have_their_labels():
     }
 
 
+@pytest.mark.parametrize(("dtype", "lines"), [
+    ("f4", ["- a: 16777218", "- b: 0.1", "- c: 0.33333334", "- d: 2"]),
+    ("f8", ["- a: 16777217.5", "- b: 0.1", "- c: 0.3333333333333333", "- d: 2"]),
+])  # fmt: skip
+def test_numbers_lose_no_digit_that_matters(dtype, lines):
+    definition = replace(
+        FILL,
+        observation_space=spaces.Box(-np.inf, np.inf, (4,), dtype),
+        observation_space_mapping=lambda tank: [16777217.5, 0.1, 1 / 3, 2.0],
+        observation_labels=list("abcd"),
+    )
+    assert describe(env_of(definition)).splitlines()[2:6] == lines
+
+
 def test_timelines_name_actions_by_their_labels():
     trajectories = collect_episodes(Tank, {"filler": RULE}, seeds=[1], points=POINTS)
     axes = plot_timeline(trajectories).axes
@@ -267,6 +392,7 @@ def test_timelines_name_actions_by_their_labels():
 
 @pytest.mark.parametrize("labels", [
     *[{"action_labels": labels} for labels in (["a", "b"], {0: "a", 1: "b"}, "abc", ["a", "b", 3])],
+    *[{"action_labels": labels} for labels in (["a", "b", "a"], ["a", "b", " "], Valve)],
     *[{"observation_labels": labels} for labels in (["a", "b"], {"level": "a"})],
     {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
     {"observation_labels": ["a", "b"], "observation_space": spaces.Box(0, 1, (2, 2))},

@@ -1,8 +1,13 @@
 """A language model decides: its endpoint answers rightly, wrongly, late, with garbage, or never."""
 
+import copy
 import json
 import pickle
 import sys
+from collections import Counter
+from functools import partial
+from multiprocessing import get_context
+from threading import Lock
 from types import SimpleNamespace
 
 import pytest
@@ -20,7 +25,7 @@ from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, describe
 from .endpoint import endpoint, fails, says
 from .tank import FILL, Tank, filling, levels, played
 
-pytest.importorskip("openai")
+openai = pytest.importorskip("openai")
 
 
 @pytest.fixture(autouse=True)
@@ -70,7 +75,8 @@ def test_numbers_are_checked_against_their_bounds_here_as_well():
 
 
 def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parsed():
-    with endpoint([says("ajar"), says("Open")]) as (address, requests):
+    parts = [{"type": "text", "text": "Op"}, {"type": "thought"}, {"type": "text", "text": "en"}]
+    with endpoint([says("ajar"), says(parts)]) as (address, requests):
         assert played(model(address))[0] == played(lambda observation: 2)[0]
     answer, correction = requests[1]["messages"][-2:]
     assert answer == {"role": "assistant", "content": "ajar"}
@@ -89,11 +95,15 @@ def test_temporary_failures_are_tried_again(answer):
 
 
 @pytest.mark.parametrize(("answer", "kind", "error", "match"), [
-    (fails(500), "failed", LanguageModelError, "fake cannot be asked"),
+    (fails(500), "http", LanguageModelError, "fake cannot be asked"),
     ("<html>down</html>", "failed", LanguageModelError, "fake gave no answer"),
-    (says(None, refusal="no"), "failed", LanguageModelError, "fake gave no answer"),
+    (says(None, refusal="no"), "refused", LanguageModelError, "gave no answer: it refused: 'no'"),
+    (says([{"refusal": "no"}]), "refused", LanguageModelError, "gave no answer: it refused: 'no'"),
+    (says(None, finish="content_filter"), "refused", LanguageModelError, "content_filter"),
+    (says("open", finish="length"), "failed", LanguageModelError, "max_tokens is used up"),
+    (says(""), "failed", LanguageModelError, "its content is empty"),
     (says("ajar"), "illegal", InvalidActionError, "'ajar' names no legal action"),
-], ids=["500", "HTML", "refusal", "wrong"])  # fmt: skip
+], ids=["500", "HTML", "refusal", "part", "filter", "cut off", "empty", "wrong"])  # fmt: skip
 def test_a_lasting_failure_is_an_error_and_a_fallback_answers(answer, kind, error, match):
     with endpoint([answer]) as (address, requests):
         with pytest.raises(error, match=match):
@@ -115,10 +125,49 @@ def test_a_missing_key_is_told_of_and_a_refused_one_is_not_tried_again(monkeypat
     assert len(requests) == 1
 
 
-def test_an_endpoint_without_structured_output_is_asked_without():
-    with endpoint([fails(400, "response_format is not supported"), OPEN]) as (address, requests):
-        assert played(model(address)) == played(lambda observation: 2)
+@pytest.mark.parametrize(("status", "problem"), [
+    (400, "response_format is not supported"), (422, "extra inputs are not permitted"),
+    (404, "no endpoint can do structured outputs"), (500, "unknown response_format"),
+])  # fmt: skip
+def test_an_endpoint_without_structured_output_is_asked_without(status, problem):
+    with endpoint([fails(status, problem), OPEN]) as (address, requests):
+        assert played(model(address, retries=0)) == played(lambda observation: 2)
     assert ["response_format" in request for request in requests] == [True] + [False] * 5
+    assert "schema" not in json.dumps(requests[-1])
+
+
+@pytest.mark.parametrize(("answer", "kind"), [(fails(404, "no such model"), "http"), (0.5, "late")])
+def test_another_error_leaves_structured_output_as_it_is(answer, kind):
+    with endpoint([answer]) as (address, _):
+        policy = FallbackPolicy(model(address, timeout=0.1, retries=0))
+        assert played(policy) == played(RULE)
+    assert policy.policy.structured
+    assert policy.counts[kind] == 5
+
+
+@pytest.mark.parametrize("wrap", [lambda make: None, lambda make: make(), lambda make: make])
+def test_each_process_has_its_own_connection(wrap):
+    async def closing(observation):
+        await policy._client_here().close()
+        return 2
+
+    with endpoint([OPEN]) as (address, requests):
+        make = partial(openai.AsyncOpenAI, base_url=address, api_key="a key")
+        policy = model(address, client=wrap(make))
+        process = get_context("fork").Process(target=played, args=(policy,))
+        assert played(policy) == played(policy)
+        process.start()
+        process.join()
+        assert played(policy) == played(closing)
+    assert process.exitcode == 0
+    ports = Counter(request["port"] for request in requests)
+    assert sorted(ports.values()) == [5, 15]
+
+
+def test_a_client_that_cannot_be_copied_is_refused_elsewhere():
+    policy = LanguageModelPolicy("own", client=SimpleNamespace(chat=Lock()))
+    with pytest.raises(LanguageModelError, match="client= be a function that makes it"):
+        played(copy.copy(policy))
 
 
 def test_requests_contain_the_latest_decisions_of_the_agent():

@@ -16,10 +16,10 @@ from simenv_marl import RULE, aec_env, evaluate, simulate, simulate_many, single
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.errors import InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, action_values
-from simenv_marl.seats import FallbackPolicy
+from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 from tests.worlds.models import follow_the_rule, stacks
 
-from .tank import FILL, POINTS, Tank, experiment, levels, log_of, played
+from .tank import FILL, POINTS, Tank, experiment, filling, levels, log_of, played
 
 
 def quick(observation):
@@ -77,6 +77,27 @@ def compared(policy):
 )
 def test_a_coroutine_function_answers_as_a_function_does(run, plain):
     assert run(slow) == run(plain)
+
+
+@pytest.mark.parametrize("run", [played, in_an_environment, compared, collected])
+@pytest.mark.parametrize("wrap", [
+    lambda policy: policy, FallbackPolicy, lambda policy: RecordedPolicy(policy, os.devnull),
+    partial(FallbackPolicy, batched),  # which fails
+])  # fmt: skip
+def test_extras_may_stand_beside_actions_wherever_policies_answer(run, wrap):
+    async def later(observation):
+        return await slow(observation), {"odds": 0.5}
+
+    assert run(wrap(later)) == run(slow)
+
+
+def test_an_action_that_looks_like_an_action_with_extras_is_an_action():
+    pair = spaces.Tuple([spaces.Discrete(3), spaces.Dict({"odds": spaces.Discrete(2)})])
+    seen = []
+    points = {Tank.fill: filling(pair, lambda action: seen.append(action) or 1.0)}
+    for answer in ((2, {"odds": 1}), ((2, {"odds": 1}), {"odds": 0})):
+        played(FallbackPolicy(lambda observation, answer=answer: answer), points=points)
+    assert seen == [(2, {"odds": 1})] * 10
 
 
 @pytest.mark.parametrize("run", [

@@ -2,26 +2,23 @@
 
 import asyncio
 import copy
-import json
 import os
 import pickle
 import time
+from contextlib import suppress
 
-import numpy as np
 import pytest
-from gymnasium import spaces
 
 from simenv_marl import RULE, branch, clone, evaluate, single_env
 from simenv_marl.errors import DefinitionError, InvalidActionError, OptionValueError
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 
-from .tank import FILL, POINTS, Tank, experiment, filling, levels, played
+from .tank import FILL, POINTS, Tank, experiment, levels, played
 
 
 def counted(**numbers):
-    return (
-        dict.fromkeys(("asked", "retried", "late", "failed", "illegal", "fallbacks"), 0) | numbers
-    )
+    kinds = ("asked", "retried", "late", "refused", "http", "failed", "illegal", "fallbacks")
+    return dict.fromkeys(kinds, 0) | numbers
 
 
 def raises(observation):
@@ -40,6 +37,32 @@ def late(observation):
 
 async def never(observation):
     await asyncio.sleep(600)
+
+
+async def stubborn(observation):
+    for _ in range(9):
+        with suppress(asyncio.CancelledError):
+            await asyncio.sleep(0.1)
+
+
+async def cancelled(observation):
+    raise asyncio.CancelledError
+
+
+def cancelled_at_once(observation):
+    raise asyncio.CancelledError
+
+
+async def exits(observation):
+    raise SystemExit
+
+
+class BusyError(Exception):
+    status_code = 503
+
+
+def busy(observation):
+    raise BusyError
 
 
 def illegal(observation):
@@ -61,6 +84,7 @@ def two(observation):
 @pytest.mark.parametrize("retries", [0, 2])
 @pytest.mark.parametrize(("policy", "kind"), [
     (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"),
+    (stubborn, "late"), (cancelled, "failed"), (cancelled_at_once, "failed"), (busy, "http"),
     (illegal, "illegal"), (illegal_later, "illegal"),
 ])  # fmt: skip
 def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
@@ -70,6 +94,12 @@ def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, ret
     tries = Tank.days * (1 + retries)
     assert guarded.counts == counted(asked=5, fallbacks=5, retried=tries - 5, **{kind: tries})
     assert guarded.last_error is not None
+
+
+def test_an_exit_of_a_coroutine_ends_the_simulation_and_not_the_event_loop():
+    with pytest.raises(SystemExit):
+        played(FallbackPolicy(exits))
+    assert played(FallbackPolicy(illegal_later)) == played(RULE)
 
 
 def test_an_answer_after_a_retry_is_used():
@@ -161,6 +191,27 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
     assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
+def test_fallbacks_are_a_share_of_the_decisions_of_their_policy():
+    async def counting(observation, *, _decision):
+        _decision.count(tokens=3, words=1)
+        return await sometimes(observation, _decision=_decision)
+
+    contenders = {"guarded": {"filler": FallbackPolicy(counting)}, "plain": {"filler": one}}
+    found = evaluate(Tank, contenders, seeds=range(4), points=POINTS)
+    assert found.summary()["fallbacks"].tolist() == [0.1, 0.0]
+    seats = found.seats.set_index(["contender", "agent"])
+    assert seats.loc[("guarded", "filler"), "seconds"] > 0
+    assert seats.drop(columns=["seconds", "failed"]).to_dict("index") == {
+        ("guarded", "filler"): {
+            "decisions": 20, "asked": 20, "fallbacks": 2, "tokens": 60, "words": 20
+        },
+        **{
+            key: {"decisions": 20, "asked": 0, "fallbacks": 0, "tokens": 0, "words": 0}
+            for key in (("guarded", "drainer"), ("plain", "filler"), ("plain", "drainer"))
+        },
+    }  # fmt: skip
+
+
 def test_contenders_with_many_fallbacks_are_marked():
     contenders = {
         "bad": {"filler": FallbackPolicy(raises)},
@@ -222,94 +273,3 @@ def test_copies_and_pickles_count_together():
     played(copy.deepcopy(guarded))
     played(pickle.loads(pickle.dumps(guarded)))
     assert guarded.counts == counted(asked=10, failed=10, fallbacks=10)
-
-
-# -- recordings -----------------------------------------------------------------------------------
-
-
-class Asked:
-    """A policy that counts how often it is asked."""
-
-    def __init__(self):
-        self.times = 0
-
-    def __call__(self, observation, *, _decision):
-        self.times += 1
-        return RULE if _decision.number == 2 else int(observation[0] * 1000) % 3
-
-
-class Waiting(Asked):
-    async def __call__(self, observation, *, _decision):
-        await asyncio.sleep(0)
-        return super().__call__(observation, _decision=_decision)
-
-
-@pytest.mark.parametrize("kind", [Asked, Waiting])
-def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
-    first, path = kind(), tmp_path / "answers.jsonl"
-    recorded = levels(RecordedPolicy(first, path), range(4))
-    assert first.times == 20
-    assert len(path.read_text().splitlines()) == 20
-    entry = json.loads(path.read_text().splitlines()[0])
-    assert entry.keys() == {"seed", "agent", "number", "observation", "answer"}
-    assert entry["agent"] == "filler"
-    second = kind()
-    assert (
-        levels(RecordedPolicy(second, path), range(5))[:4] == recorded == levels(kind(), range(4))
-    )
-    assert second.times == 5  # those of the new seed
-
-
-def test_a_recording_is_used_after_a_crash_but_not_for_other_observations(tmp_path):
-    path = tmp_path / "answers.jsonl"
-
-    def asked_again():
-        policy = Asked()
-        assert played(RecordedPolicy(policy, path)) == played(Asked())
-        return policy.times
-
-    assert asked_again() == 5
-    whole = path.read_text()
-    path.write_text(whole[:-9])  # the last line was not finished
-    assert asked_again() == 1
-    with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
-        assert asked_again() == 0
-    path.write_text(whole.replace(json.loads(whole.splitlines()[0])["observation"], "other"))
-    assert asked_again() == 1
-
-
-def test_illegal_answers_are_not_recorded(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    guarded = FallbackPolicy(RecordedPolicy(illegal, path))
-    assert played(guarded) == played(RULE)
-    assert not path.exists()
-    assert guarded.counts["illegal"] == 5
-
-
-PARTS = {
-    "box": (spaces.Box(-1, 1, (2,), np.float32), np.array([0.1, -0.7], np.float32)),
-    "scalar": (spaces.Box(0, 1, (1,), np.float64), 0.1 + 0.2),
-    "nested": (
-        spaces.Dict(
-            {
-                "a": spaces.Discrete(3),
-                "b": spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.MultiBinary(2)]),
-            }
-        ),
-        {"a": 2, "b": (0.25, np.array([1, 0], np.int8))},
-    ),
-    "many": (spaces.MultiDiscrete([3, 4]), np.array([2, 3])),
-}
-
-
-@pytest.mark.parametrize("kind", PARTS)
-def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
-    space, action = PARTS[kind]
-    seen = []
-    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
-    for policy in (lambda observation: action, raises):
-        played(RecordedPolicy(policy, tmp_path / "answers"), points=points)
-    assert len(seen) == 10
-    for given, repeated in zip(seen[:5], seen[5:], strict=True):
-        assert space.contains(repeated)
-        np.testing.assert_equal(repeated, given)

@@ -394,7 +394,9 @@ fault_of("SeesNoNumber", "error", "contain NaN", "observation[1]: nan",
 fault_of("SeesNoEnd", "error", "infinite numbers", "observation[0]: 0 to inf",
          observation_space_mapping=lambda walk: [float("inf") if walk.log else 0, 1],
          observation_space=spaces.Box(-np.inf, np.inf, (2,)))  # fmt: skip
-for labels in ({1: "left", 2: "stay", 3: "right"}, ["left", "right"]):
+for labels in (
+    {1: "left", 2: "stay", 3: "right"}, ["left", "right"], ["left", "left", "right"],
+):  # fmt: skip
     fault_of("Labels", "error", "callable of labels", "not texts for the parts", "in episode 1",
              action_labels=lambda walk, labels=labels: labels)  # fmt: skip
 fault_of("NoLabels", "error", "The action_labels of", "KeyError",

@@ -40,6 +40,7 @@ from .plans.policies import (
     is_asked_alone,
     is_planner,
     policy_for,
+    split_extras,
     takes_info,
     takes_state,
     two_arguments,
@@ -81,7 +82,7 @@ __all__ = [  # noqa: RUF022 - by subject
     # Policies.
     "COUNTS", "Answer", "Answers", "AskingPolicy", "Caller", "DeferredPolicy", "EpisodePolicy",
     "PolicyWrapper", "count", "has_fallback", "is_asked_alone", "is_planner", "policy_for",
-    "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
+    "split_extras", "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
     "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",

@@ -23,6 +23,7 @@ from ..core import (
     StateReader,
     is_asked_alone,
     same,
+    split_extras,
     stacker,
     taken,
     takes_state,
@@ -487,9 +488,9 @@ class _Shadow(PolicyWrapper):
     ) -> Any:
         return when_answered(self.ask(observation, info, context), self._record)
 
-    def _record(self, action: Action) -> Any:
+    def _record(self, answer: Action) -> Any:
         shadow_actions = np.empty((), object)
-        shadow_actions[()] = action
+        shadow_actions[()], _ = split_extras(answer)
         return RULE, {SHADOW: shadow_actions}
 
 

@@ -7,7 +7,7 @@ from functools import partial
 from itertools import chain, groupby, product
 from math import inf, nan, sqrt
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from .runner import (
     TEAM,
     Contenders,
     Metrics,
+    Outcome,
     Result,
     Row,
     Runner,
@@ -52,6 +53,19 @@ FALLBACK_LIMIT = 0.05
 """A contender with a larger share of decisions by fallbacks is marked."""
 
 
+NO_COUNTS: Final = dict.fromkeys(("decisions", "asked", FALLBACKS, "seconds", "tokens"), 0)
+"""The columns of ``Evaluation.seats`` that are always there."""
+
+
+class Run(NamedTuple):
+    """An episode of a contender, and its rows of the table."""
+
+    contender: str
+    seed: int
+    result: Result
+    rows: list[Row]
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """The results of contenders on the same seeds. Made by ``evaluate``.
@@ -66,6 +80,11 @@ class Evaluation:
             the columns ``status`` and ``error``, as ``run_experiment`` has them.
         baseline: The contender that all others are compared with, or None.
         confidence: The confidence level of the intervals.
+        seats: A ``DataFrame`` with one row for each contender and agent. Columns: ``decisions``;
+            ``asked``, those that were put to a ``FallbackPolicy``; ``fallbacks``, those that its
+            fallback answered; ``seconds``, the time that policies with ``_decision``,
+            ``_environment`` or ``_state`` took for all answers; ``tokens`` of language models; and
+            all other numbers that policies have counted by ``Decision.count``.
 
     In all methods, ``metric`` is ``"return"``, ``"length"`` or the name of a metric; another one is
     an ``OptionValueError``.
@@ -74,6 +93,7 @@ class Evaluation:
     frame: "DataFrame"
     baseline: str | None
     confidence: float
+    seats: "DataFrame | None" = None
 
     def __repr__(self) -> str:
         values = self.values()
@@ -102,8 +122,8 @@ class Evaluation:
             baseline also ``difference``, ``difference_low`` and ``difference_high``: the mean
             paired difference from the baseline on the same seeds. Unknown bounds are nan; then
             there is a column ``note``, which says why. If fallbacks are counted, ``fallbacks`` is
-            the share of decisions that they answered, and the note of a contender with more than
-            5 % of them says so.
+            their share of the decisions that were put to a ``FallbackPolicy``, and the note of a
+            contender with more than 5 % says so.
         """
         values = self.values(metric)
         proportions = values.columns if is_proportion(values.to_numpy()) else ()
@@ -116,10 +136,9 @@ class Evaluation:
             columns = ["difference", "difference_low", "difference_high"]
             table = table.join(estimates.astype(float).set_axis(columns, axis=1))
             table.loc[self.baseline, columns] = 0.0
-        if FALLBACKS in self.frame:
-            team = self.frame[self.frame["agent"] == TEAM]
-            sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
-            table[FALLBACKS] = sums[FALLBACKS] / sums["length"].clip(lower=1)
+        if FALLBACKS in self.frame and self.seats is not None:
+            sums = self.seats.groupby("contender")[[FALLBACKS, "asked"]].sum()
+            table[FALLBACKS] = sums[FALLBACKS] / sums["asked"].clip(lower=1)
             for name, share in table[FALLBACKS].items():
                 if share > FALLBACK_LIMIT:
                     separator = "; " if notes[name] else ""
@@ -331,20 +350,23 @@ def evaluate(
     # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
     order: dict[Any, int] = {run: place for place, run in enumerate(product(plans, all_seeds))}
-    rows: list[Row] = []
+    finished: list[Run] = []
     start = 0
     with progress_bar(len(order), progress, "episode") as bar:
         for end in _checkpoints(len(all_seeds), width):
             runs = list(product(plans, all_seeds[start:end]))
             start = end
-            rows += chain(
+            finished += chain(
                 *spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar)
             )
-            rows.sort(key=lambda row: order[row["contender"], row["seed"]])
+            finished.sort(key=lambda run: order[run.contender, run.seed])
+            rows = [row for run in finished for row in run.rows]
             columns = runner.columns
             if any(row["status"] == "error" for row in rows):
                 columns += STATUS_COLUMNS
-            evaluation = Evaluation(make_table(columns, rows), baseline, float(confidence))
+            evaluation = Evaluation(
+                make_table(columns, rows), baseline, float(confidence), _seats_of(finished)
+            )
             if width is not None and evaluation._widest() <= width:
                 break
     for name, plan in plans.items():
@@ -372,19 +394,37 @@ def _run(
     runner: Runner,
     runs: Sequence[tuple[str, int]],
     bar: Any,
-) -> list[Row]:
+) -> list[Run]:
     """Run pairs of contender and seed."""
-    rows: list[Row] = []
+    finished: list[Run] = []
 
     def report(name: str, seed: int, result: Result) -> None:
-        rows.extend(runner.rows(name, seed, result))
+        finished.append(Run(name, seed, result, runner.rows(name, seed, result)))
         bar.update()
 
     with reuse_resources():
         for name, group in groupby(runs, lambda run: run[0]):
             seeds = [seed for _, seed in group]
             runner.run(runner.plan(simulation, name), name, seeds, partial(report, name))
-    return rows
+    return finished
+
+
+def _seats_of(runs: Iterable[Run]) -> "DataFrame":
+    """Add up the decisions of each contender's agents, and all that their policies have counted."""
+    from pandas import DataFrame
+
+    seats = ["contender", "agent"]
+    rows = [
+        dict(zip(seats, (run.contender, agent), strict=True))
+        | NO_COUNTS
+        | run.result.counts.get(agent, {})
+        | {"decisions": own["length"]}
+        for run in runs
+        if isinstance(run.result, Outcome)
+        for agent, own in run.result.agents.items()
+    ]
+    table = DataFrame(rows, columns=None if rows else [*seats, *NO_COUNTS])
+    return table.groupby(seats, sort=False).sum().reset_index()
 
 
 # -- statistics -----------------------------------------------------------------------------------

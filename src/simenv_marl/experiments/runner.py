@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from math import nan
@@ -70,11 +70,13 @@ class Outcome:
             number of its decisions) and ``fallbacks`` (the number that its fallback answered).
         metrics: The result of each metric.
         team: What the team has earned, by ``team_reward=``. None without it.
+        counts: For each of these agents, all numbers that its policies have counted.
     """
 
     agents: dict[str, dict[str, float]]
     metrics: dict[str, Value]
     team: float | None = None
+    counts: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 Result = Outcome | str
@@ -306,13 +308,15 @@ class Tally:
 
         Agents that end before the simulation get their last reward when it is over.
         """
-        results = self.outcomes[episode.seed].agents
+        outcome = self.outcomes[episode.seed]
+        results = outcome.agents
         agents = [*episode.ended.values(), *episode.agents.values()]
         for agent in agents if episode.pending is None else [episode.pending]:
             if agent.name in results:
                 own = results[agent.name]
                 own["return"] += agent.reward
-                own[FALLBACKS] = agent.fallbacks
+                own[FALLBACKS] = agent.counts.get(FALLBACKS, 0)
+                outcome.counts[agent.name] = agent.counts
 
 
 def _no_decision() -> dict[str, float]:

@@ -41,6 +41,7 @@ from ..core import (
     is_asked_alone,
     reuse_resources,
     split_batch,
+    split_extras,
     stacked,
     stacker,
     takes_info,
@@ -260,7 +261,7 @@ def read_answers(answers: Action, policy: object, number: int) -> Answers:
     Raises:
         InvalidActionError: The number of actions is wrong.
     """
-    answers, extras = _split_extras(answers)
+    answers, extras = split_extras(answers)
     actions = [RULE] * number if answers is RULE else split_batch(answers, integers=True)
     if actions is None or len(actions) != number:
         returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
@@ -270,13 +271,6 @@ def read_answers(answers: Action, policy: object, number: int) -> Answers:
             " order"
         )
     return actions, extras
-
-
-def _split_extras(answer: Action) -> tuple[Action, Mapping[str, Any]]:
-    """Split the result of a policy into the action, or the actions, and the extras."""
-    if type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping):
-        return answer
-    return answer, {}
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -438,7 +432,7 @@ class BatchRun:
         agent, key = _pending(episode)
         try:
             with episode.context() if self.plan.options.global_rng else nullcontext():
-                action, extras = _split_extras(answer())
+                action, extras = split_extras(answer(), agent.point.definition.action_space)
         except BaseException as error:
             episode.annotate(error)
             raise

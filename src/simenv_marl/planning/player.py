@@ -30,6 +30,7 @@ from ..core import (
     is_planner,
     pending_view,
     policy_for,
+    split_extras,
     two_arguments,
 )
 from ..envs import (
@@ -217,10 +218,13 @@ class Player:
         if policy is None:
             return RULE
         observation, info = self._observe(name)
-        if not isinstance(policy, EpisodePolicy):
-            return policy(observation, info)
         agent = self.episode.agents.get(name, self.agent)
-        return policy.answer(self.episode, agent, observation, info)
+        if isinstance(policy, EpisodePolicy):
+            answer = policy.answer(self.episode, agent, observation, info)
+        else:
+            answer = policy(observation, info)
+        action, _ = split_extras(answer, agent.point.definition.action_space)
+        return action
 
     def _observe(self, name: str) -> tuple[Observation, Info]:
         """Return the latest observation and info of an agent."""

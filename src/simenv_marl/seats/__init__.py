@@ -6,7 +6,8 @@ repeats their answers.
 """
 
 from ..core import Decision
-from .descriptions import describe, parse
+from .answers import parse
+from .descriptions import describe
 from .language import LanguageModelPolicy
 from .policies import FallbackPolicy, RecordedPolicy
 

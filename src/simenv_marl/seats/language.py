@@ -4,6 +4,7 @@ import json
 import os
 from collections import deque
 from collections.abc import Callable
+from copy import deepcopy
 from inspect import cleandoc
 from itertools import chain
 from time import perf_counter
@@ -23,7 +24,10 @@ from ..errors import (
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation, check_count
 from . import descriptions
-from .descriptions import Schema, action_schema, at_decision, parse
+from .answers import parse
+from .descriptions import Schema, action_schema, at_decision
+from .policies import kind_of
+from .recordings import digest_of
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""
@@ -36,7 +40,7 @@ class LanguageModelPolicy:
     actions. Endpoints without structured output are asked without a schema; an answer in plain text
     is parsed. The policy validates each answer. After an illegal or a missing answer it asks again;
     the client repeats failed requests. Then the policy raises an error, which a ``FallbackPolicy``
-    catches. In clones, the rule decides.
+    catches. In clones, the rule decides. Each process has its own connections.
 
     Attributes:
         model: The name of the model.
@@ -77,8 +81,8 @@ class LanguageModelPolicy:
                 repeats a request.
             timeout: The time limit of a request, in seconds.
             structured: Whether to ask for structured output.
-            client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of a new one.
-                It must not be used in another event loop.
+            client: An ``openai.AsyncOpenAI``, an object like it, or a callable that makes one. It
+                must not be used in another event loop. Other processes use copies, or make one.
             **request: Further arguments of each request, such as ``temperature=0.0``.
 
         Raises:
@@ -101,11 +105,12 @@ class LanguageModelPolicy:
         self._retries = check_count(retries, "retries")
         self._request = {"timeout": timeout, **request}
         self._client = client
-        self._own_client: Any = None
+        # A forked process keeps its parent's clients: their end would close the connections.
+        self._clients = {os.getpid(): client} if hasattr(client, "chat") else {}
         self._token = uuid4().hex
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_own_client": None}
+        return {**vars(self), "_clients": {}}
 
     @property
     def usage(self) -> dict[str, float]:
@@ -127,7 +132,12 @@ class LanguageModelPolicy:
         return text
 
     def _prompt(self, decision: Decision) -> str:
-        return f"{self._system_text(decision)}\n\n{self._describe(decision)}"
+        return f"{self._system_text(decision, self.structured)}\n\n{self._describe(decision)}"
+
+    def identify(self, decision: Decision) -> dict[str, str]:
+        """Return the name of the model and a digest of the prompt, for recordings."""
+        prompt = (self._system_text(decision, True), self._describe(decision))
+        return {"model": self.model, "prompt": digest_of(prompt)}
 
     async def __call__(
         self, observation: Observation, info: object = None, *, _decision: Decision
@@ -144,14 +154,13 @@ class LanguageModelPolicy:
         )
         question = {"role": "user", "content": self._describe(_decision)}
         messages = [
-            {"role": "system", "content": self._system_text(_decision)},
             *chain.from_iterable(turns),
             question,
         ]
         for retry in range(self._retries + 1):
             text = ""
             try:
-                text = await self._ask(messages, _decision)
+                text = await self._ask(messages, _decision, self.structured)
                 action = parse(_decision, text)
                 break
             except (InvalidActionError, _NoAnswerError) as error:
@@ -167,21 +176,22 @@ class LanguageModelPolicy:
 
     # -- prompts ----------------------------------------------------------------------------------
 
-    def _system_text(self, decision: Decision) -> str:
+    def _system_text(self, decision: Decision, structured: bool) -> str:
         lines = [f"You decide for {decision.agent!r} in a running simulation."]
         if decision.doc:
             lines.append(f"What it decides: {cleandoc(decision.doc)}")
-        schema = json.dumps(_answer_schema(decision), ensure_ascii=False)
-        lines.append(
-            f"Answer with one JSON object that fits this JSON schema, and nothing else: {schema}"
-        )
+        form = 'of the form {"action": ...} with a legal action, and nothing else'
+        if structured:
+            schema = json.dumps(_answer_schema(decision), ensure_ascii=False)
+            form = f"that fits this JSON schema, and nothing else: {schema}"
+        lines.append(f"Answer with one JSON object {form}")
         if self._instructions:
             lines.append(self._instructions)
         return "\n".join(lines)
 
     # -- requests ---------------------------------------------------------------------------------
 
-    async def _ask(self, messages: list[Message], decision: Decision) -> str:
+    async def _ask(self, messages: list[Message], decision: Decision, structured: bool) -> str:
         """Send a request; return the text of the answer.
 
         Raises:
@@ -190,52 +200,52 @@ class LanguageModelPolicy:
         """
         request: dict[str, object] = {
             "model": self.model,
-            "messages": messages,
+            "messages": [
+                {"role": "system", "content": self._system_text(decision, structured)},
+                *messages,
+            ],
             **self._request,
         }
-        if self.structured:
+        if structured:
             schema = {"name": "decision", "schema": _answer_schema(decision), "strict": True}
             request["response_format"] = {"type": "json_schema", "json_schema": schema}
         start = perf_counter()
         try:
-            client = self._client or self._default_client()
+            client = self._client_here()
             response = await client.chat.completions.create(**request)
         except MissingExtraError:
             raise
         except Exception as error:
-            if self.structured and _refuses_schema(error):
-                self.structured = False
-                return await self._ask(messages, decision)
+            if structured and _may_refuse_schema(error):
+                return await self._ask(messages, decision, structured=False)
             raise LanguageModelError(
-                f"{self.model} cannot be asked: {describe_error(error)}"
+                f"{self.model} cannot be asked: {describe_error(error)}", kind_of(error)
             ) from error
         finally:
             count(self._token, requests=1, seconds=perf_counter() - start)
         usage = getattr(response, "usage", None)
-        count(
-            self._token,
-            prompt_tokens=getattr(usage, "prompt_tokens", 0) or 0,
-            completion_tokens=getattr(usage, "completion_tokens", 0) or 0,
-        )
-        try:
-            message = response.choices[0].message
-        except (AttributeError, LookupError, TypeError):
-            raise _NoAnswerError(
-                f"{self.model} gave no answer: the endpoint returned {short_repr(response)}"
-            ) from None
-        if not isinstance(message.content, str) or not message.content.strip():
-            refusal = short_repr(getattr(message, "refusal", None))
-            raise _NoAnswerError(f"{self.model} gave no answer: it refused: {refusal}")
-        return message.content
+        tokens = {
+            name: getattr(usage, name, 0) or 0 for name in ("prompt_tokens", "completion_tokens")
+        }
+        count(self._token, **tokens)
+        decision.count(tokens=sum(tokens.values()))
+        self.structured &= structured
+        return _content(response, self.model)
 
-    def _default_client(self) -> Any:
-        if self._own_client is None:
-            openai = import_extra("openai", "LanguageModelPolicy")
-            client = openai.AsyncOpenAI(**self._client_options)
-            finalizer = finalize(self, _close, client, os.getpid())
+    def _client_here(self) -> Any:
+        """Return the client of this process."""
+        process = os.getpid()
+        if process not in self._clients:
+            client = self._client
+            if client is None:
+                openai = import_extra("openai", "LanguageModelPolicy")
+                client = openai.AsyncOpenAI(**self._client_options)
+            else:
+                client = _copied(client) if hasattr(client, "chat") else client()
+            self._clients[process] = client
+            finalizer = finalize(self, _close, client, process)
             finalizer.atexit = False
-            self._own_client = client
-        return self._own_client
+        return self._clients[process]
 
 
 class _NoAnswerError(LanguageModelError):
@@ -251,13 +261,65 @@ def _answer_schema(decision: Decision) -> Schema:
     }
 
 
-def _refuses_schema(error: Exception) -> bool:
-    """Return whether an endpoint has refused a request because of its ``response_format``."""
+def _content(response: Any, model: str) -> str:
+    """Return the text of a model's response.
+
+    Raises:
+        _NoAnswerError: It has none, or not the whole.
+    """
+    choice = next(iter(getattr(response, "choices", None) or ()), None)
+    message = getattr(choice, "message", None)
+    content = getattr(message, "content", None)
+    refusal = getattr(message, "refusal", None)
+    reason = getattr(choice, "finish_reason", None)
+    if isinstance(content, list):
+        parts = [part if isinstance(part, dict) else vars(part) for part in content]
+        refusal = refusal or "".join(part.get("refusal", "") for part in parts)
+        content = "".join(part["text"] for part in parts if part.get("type") == "text")
+    kind = "failed"
+    if message is None:
+        problem = f"the endpoint returned {short_repr(response)}"
+    elif refusal or reason == "content_filter":
+        problem = f"it refused: {short_repr(refusal or reason)}"
+        kind = "refused"
+    elif reason == "length":
+        problem = "it was cut off, because max_tokens is used up"
+    elif content and content.strip():
+        return str(content)
+    else:
+        problem = f"its content is empty, and its finish_reason {reason!r}"
+    raise _NoAnswerError(f"{model} gave no answer: {problem}", kind)
+
+
+def _may_refuse_schema(error: Exception) -> bool:
+    """Return whether an endpoint may have refused a request because of its ``response_format``.
+
+    Endpoints say so in many ways.
+    """
     status = getattr(error, "status_code", None)
-    return status in (400, 404, 422) and "response_format" in str(error)
+    return status in (400, 404, 415, 422, 501) or "response_format" in str(error)
+
+
+def _copied(client: Any) -> Any:
+    """Copy a client of the user, without its connections.
+
+    Raises:
+        LanguageModelError: It cannot be copied.
+    """
+    http: Any = getattr(client, "_client", None)
+    try:
+        if type(http).__module__.startswith("openai"):
+            http = type(http)(base_url=client.base_url, timeout=client.timeout)
+            return client.copy(http_client=http)
+        return deepcopy(client)
+    except Exception as error:
+        raise LanguageModelError(
+            f"{short_repr(client)} belongs to another process, and cannot be copied; let client= be"
+            f" a function that makes it ({describe_error(error)})"
+        ) from error
 
 
 def _close(client: Any, process: int) -> None:
     """Close the connections of a client in the policies' thread, without waiting for it."""
-    if os.getpid() == process:  # not in a fork, which has no part in the connections
+    if os.getpid() == process and hasattr(client, "close"):  # not in a fork
         Answer(client.close(), lambda answer: None)

@@ -1,31 +1,53 @@
 """Policies around policies: fallbacks for failing policies, and recordings of answers."""
 
 import asyncio
-import json
 import os
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from hashlib import blake2b
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import suppress
+from copy import copy
 from inspect import isawaitable
-from pathlib import Path
 from time import monotonic
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from uuid import uuid4
 
-import numpy as np
-
-from ..core import COUNTS, Caller, Decision, Info, PolicyWrapper, count, waits, when_answered
+from ..core import (
+    COUNTS,
+    Caller,
+    Decision,
+    Info,
+    PolicyWrapper,
+    count,
+    waits,
+    when_answered,
+)
 from ..errors import (
     InvalidActionError,
+    LanguageModelError,
     OptionValueError,
     describe_error,
     short_repr,
-    warn_user,
 )
 from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
-from .descriptions import to_action
+from .recordings import Outcome, Recording, outcome_of, question_of
 
-KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
+KINDS: Final = (
+    "asked",
+    "retried",
+    "late",
+    "refused",
+    "http",
+    "failed",
+    "illegal",
+    "fallbacks",
+)
 """The events that a ``FallbackPolicy`` counts."""
+
+Settled = tuple[Action, BaseException | None]
+"""An answer, or an error."""
+
+LEFT: Final[set[asyncio.Future[Settled]]] = set()
+"""The late answers that have not ended yet. An event loop does not keep its tasks alive."""
 
 Policy = Callable[..., Action | Awaitable[Action]]
 """A policy, as ``simulate`` takes them. It may be a coroutine function."""
@@ -57,8 +79,9 @@ class FallbackPolicy(PolicyWrapper):
         Args:
             policy: The policy, as ``simulate`` takes them. It may be a coroutine function.
             fallback: ``RULE``, or the policy that answers instead.
-            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then;
-                the time of other functions is measured afterwards. None: there is no limit.
+            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then,
+                and left behind if it does not end; the time of other functions is measured
+                afterwards. None: there is no limit.
             retries: How often the policy is asked again before the fallback answers.
 
         Raises:
@@ -68,6 +91,10 @@ class FallbackPolicy(PolicyWrapper):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
         self._ask_fallback = Caller(fallback if callable(fallback) else _leave_to_rule)
         super().__init__(policy, asks=("_decision", *self._ask_fallback.names))
+        self._recording: Recording | None = None
+        if isinstance(policy, RecordedPolicy):  # this policy records instead, also its fallback
+            self._recording = policy.recording
+            self.ask = policy.ask
         self.fallback = fallback
         self.timeout = None if timeout is None else check_seconds(timeout, "timeout")
         self.retries = check_count(retries, "retries")
@@ -79,7 +106,8 @@ class FallbackPolicy(PolicyWrapper):
     def counts(self) -> dict[str, int]:
         """The numbers of decisions, retries, faults and fallbacks.
 
-        The keys are ``asked`` (decisions), ``retried``, ``late``, ``failed``, ``illegal`` and
+        The keys are ``asked`` (decisions), ``retried``, ``late``, ``refused`` (by a language
+        model), ``http`` (errors of an endpoint), ``failed`` (other errors), ``illegal`` and
         ``fallbacks``. ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes``
         add the counts of their workers.
         """
@@ -101,58 +129,124 @@ class FallbackPolicy(PolicyWrapper):
             return answer
         return _run_without_waiting(answer)
 
+    def recorded_in(self, recording: Recording) -> "FallbackPolicy":
+        """Return a copy that records its answers, and counts together with this policy."""
+        twin = copy(self)
+        twin._recording = recording
+        return twin
+
     async def _answer(self, decision: Decision, *arguments: Any) -> Action:
-        """Answer with the arguments of a ``Caller``."""
-        self._count(decision, "asked")
+        """Answer with the arguments of a ``Caller``, or as recorded."""
+        recording = self._recording
+        if recording is None:
+            return (await self._decide(decision, *arguments)).answer
+        question = question_of(decision, self.ask.policy)
+        outcome = recording.find(question, decision)
+        if outcome is None:
+            outcome = await self._decide(decision, *arguments)
+            recording.write(question, outcome, decision)
+        else:
+            self.last_error = outcome.why or self.last_error
+            for kind, number in outcome.counts.items():
+                self._count(decision, kind, number)
+        return outcome.answer
+
+    async def _decide(self, decision: Decision, *arguments: Any) -> Outcome:
+        """Decide, by the policy or the fallback."""
+        counts: Counter[str] = Counter()
+        why = ""
+
+        def note(kind: str) -> None:
+            counts[kind] += 1
+            self._count(decision, kind)
+
+        note("asked")
         for attempt in range(self.retries + 1):
             if attempt:
-                self._count(decision, "retried")
+                note("retried")
             try:
                 answer = await self._ask_in_time(*arguments)
-                if answer is not RULE:
-                    decision.validate(answer)
-                return answer
+                outcome = outcome_of(answer, decision)
+                return outcome._replace(why=why, counts=counts)
             except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
-            except TimeoutError as error:
-                self._note(decision, "late", error)
-            except InvalidActionError as error:
-                self._note(decision, "illegal", error)
             except Exception as error:
-                self._note(decision, "failed", error)
-        self._count(decision, "fallbacks")
-        decision.count_fallback()
+                self.last_error = why = describe_error(error)
+                note(kind_of(error))
+        note("fallbacks")
         answer = self._ask_fallback(*arguments)
         if isawaitable(answer):
-            return await answer
-        return answer
+            answer = await answer
+        return outcome_of(answer, decision)._replace(by="fallback", why=why, counts=counts)
 
     async def _ask_in_time(self, *arguments: Any) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
         problem = f"the answer took longer than {self.timeout} s"
         start = monotonic()
         try:
-            answer = self.ask(*arguments)
+            try:
+                answer = self.ask(*arguments)
+            except asyncio.CancelledError as error:
+                raise RuntimeError("the policy has cancelled itself") from error
             if isawaitable(answer) and self.waits:
-                answer = await asyncio.wait_for(answer, self.timeout)
+                answer = await _within(self.timeout, answer)
         except TimeoutError as error:
             raise TimeoutError(str(error) or problem) from error
         if self.timeout is not None and monotonic() - start > self.timeout:
             raise TimeoutError(problem)
         return answer
 
-    def _note(
-        self,
-        decision: Decision,
-        kind: str,
-        error: Exception,
-    ) -> None:
-        self.last_error = describe_error(error)
-        self._count(decision, kind)
-
-    def _count(self, decision: Decision, kind: str) -> None:
+    def _count(self, decision: Decision, kind: str, number: int = 1) -> None:
         if not decision.in_clone:
-            count(self._token, **{kind: 1})
+            count(self._token, **{kind: number})
+            decision.count(**{kind: number})
+
+
+async def _within(timeout: float | None, answer: Awaitable[Action]) -> Action:
+    """Await an answer for some seconds. Then cancel it, without waiting for its end.
+
+    Raises:
+        TimeoutError: The time is up.
+        RuntimeError: The answer has cancelled itself.
+    """
+    task = asyncio.ensure_future(_settled(answer))
+    try:
+        await asyncio.wait({task}, timeout=timeout)
+    except asyncio.CancelledError:  # of the decision, not of the answer
+        task.cancel()
+        await asyncio.wait({task})
+        raise
+    if not task.done():
+        LEFT.add(task)
+        task.add_done_callback(LEFT.discard)
+        task.cancel()
+        raise TimeoutError
+    value, error = task.result()
+    if isinstance(error, asyncio.CancelledError):
+        raise RuntimeError("the policy has cancelled itself") from error
+    if error is not None:
+        raise error
+    return value
+
+
+async def _settled(answer: Awaitable[Action]) -> Settled:
+    try:
+        return await answer, None
+    except BaseException as error:  # also an exit, because it would end the event loop
+        return None, error
+
+
+def kind_of(error: Exception) -> str:
+    """Return the count to which an error of a policy adds."""
+    match error:
+        case InvalidActionError():
+            return "illegal"
+        case LanguageModelError():
+            return error.kind
+    if hasattr(error, "status_code"):
+        return "http"
+    is_late = isinstance(error, TimeoutError) or "Timeout" in type(error).__name__
+    return "late" if is_late else "failed"
 
 
 def _leave_to_rule(observation: Observation) -> Action:
@@ -168,50 +262,40 @@ def _run_without_waiting(coroutine: Coroutine[None, None, Action]) -> Action:
     raise AssertionError("the coroutine waits")
 
 
-class DecisionKey(NamedTuple):
-    """The fields of a recorded line that identify its decision."""
-
-    seed: int
-    agent: str
-    number: int
-    observation: str
-    """The digest of the observation."""
-
-
 class RecordedPolicy(PolicyWrapper):
     """A policy that records the answers of another one in a file, and repeats them.
 
-    Each answer is a line of JSON: the seed of the episode, the agent, the number of the decision, a
-    digest of the observation, and the answer. An answer is repeated without asking the other policy
-    where all of these agree. A line is written at once, so that the file can be used after a crash.
-    In clones, the fallback of the other policy answers, or the rule.
+    Each answer is a line of JSON: seed, agent and number of the decision, digests of observation
+    and legal actions, the action in the form that reaches the mapping, who has answered (the policy
+    or its fallback) and why. The answer is given again, without asking, where seed, agent,
+    observation and legal actions agree. An episode with other decisions than the recorded ones is
+    refused; a longer one is continued. A line is written at once, so that the file can be used
+    after a crash. In clones, the fallback of the other policy answers, or the rule.
+
+    A policy may have a method ``identify(decision)`` that returns a dict of texts, such as the name
+    of a language model and the digest of its prompt. The answers of another policy are refused.
 
     Attributes:
         policy: The other policy.
-        path: The path of the file.
+        recording: The file.
     """
 
     def __init__(self, policy: Policy, path: str | os.PathLike[str]) -> None:
         """Wrap a policy, as ``simulate`` takes them; it may be a coroutine function.
 
-        The file is created if needed.
+        The file is created if needed. A ``FallbackPolicy`` may be inside or outside: file and
+        counts are the same.
 
         Raises:
             OptionValueError: The folder of the file does not exist.
         """
         super().__init__(policy, asks=("_decision",))
-        self.path = Path(path)
+        self.recording = Recording(path)
         self.records = True
-        if not self.path.parent.is_dir():
-            raise OptionValueError(
-                f"{self.path} cannot be written: {self.path.parent} is no folder"
-            )
         self.fallback: Policy | Sentinel = getattr(policy, "fallback", RULE)
-        self._answers: dict[DecisionKey, Action] | None = None
-
-    def __getstate__(self) -> dict[str, object]:
-        """Return the state without the answers, because the file has them, too."""
-        return {**vars(self), "_answers": None}
+        self._guard: FallbackPolicy | None = None
+        if isinstance(policy, FallbackPolicy):
+            self._guard = policy.recorded_in(self.recording)
 
     def __call__(
         self,
@@ -225,87 +309,17 @@ class RecordedPolicy(PolicyWrapper):
 
         Return an awaitable if the answer is not recorded and the policy has to be awaited.
         """
-        if self._answers is None:
-            self._answers = self._read()
-        key = DecisionKey(
-            _decision.seed,
-            _decision.agent,
-            _decision.number,
-            digest_of(observation),
-        )
-        if key in self._answers:
-            recorded = self._answers[key]
-            if recorded is None:
-                return RULE
-            return _decision.action_space.from_jsonable(recorded)[0]
+        if self._guard is not None:
+            return self._guard(observation, info, _decision=_decision, **context)
+        question = question_of(_decision, self.policy)
+        outcome = self.recording.find(question, _decision)
+        if outcome is not None:
+            return outcome.answer
+
+        def record(answer: Action) -> Action:
+            with suppress(InvalidActionError):  # an illegal answer is not recorded
+                self.recording.write(question, outcome_of(answer, _decision), _decision)
+            return answer
+
         context["_decision"] = _decision
-        answer = self.ask(observation, info, context)
-        return when_answered(answer, lambda answer: self._record(key, answer, _decision))
-
-    def _read(self) -> dict[DecisionKey, Action]:
-        """Read the file, and end a line that a crash has left unfinished."""
-        answers: dict[DecisionKey, Action] = {}
-        content = self.path.read_bytes() if self.path.exists() else b""
-        for number, line in enumerate(content.splitlines(), 1):
-            try:
-                entry = json.loads(line)
-                key = DecisionKey(*(entry[field] for field in DecisionKey._fields))
-                answers[key] = entry["answer"]
-            except (ValueError, TypeError, LookupError):
-                if number <= content.count(b"\n"):
-                    warn_user(
-                        f"line {number} of {self.path} cannot be read, so its decision is asked"
-                        " again"
-                    )
-        if content and not content.endswith(b"\n"):
-            self._write(b"\n")
-        return answers
-
-    def _record(
-        self,
-        key: DecisionKey,
-        answer: Action,
-        decision: Decision,
-    ) -> Action:
-        """Record an answer, unless it is illegal, and return it."""
-        recorded = None
-        if answer is not RULE:
-            try:
-                action = decision.validate(answer)
-            except InvalidActionError:
-                return answer
-            space = decision.action_space
-            # A legal action for a Box of one number may be a scalar, but to_jsonable needs arrays.
-            recorded = space.to_jsonable([to_action(space, action)])
-        line = json.dumps(key._asdict() | {"answer": recorded})
-        self._write(line.encode() + b"\n")
-        assert self._answers is not None
-        self._answers[key] = recorded
-        return answer
-
-    def _write(self, line: bytes) -> None:
-        with open(self.path, "ab", buffering=0) as file:
-            file.write(line)  # in one call, so that processes can share the file
-
-
-def digest_of(observation: Observation) -> str:
-    """Return a digest of an observation: of the names, types, shapes and bytes of its parts."""
-    digest = blake2b(digest_size=12)
-
-    def add(part: Observation) -> None:
-        match part:
-            case Mapping():
-                for name in sorted(part, key=str):
-                    digest.update(str(name).encode())
-                    add(part[name])
-            case tuple() | list():
-                for item in part:
-                    add(item)
-            case np.ndarray() | np.generic() if part.dtype != object:
-                digest.update(f"{part.dtype.str}{part.shape}".encode())
-                digest.update(np.ascontiguousarray(part).tobytes())
-            case _:
-                digest.update(repr(part).encode())
-
-    add(observation)
-    return digest.hexdigest()
+        return when_answered(self.ask(observation, info, context), record)

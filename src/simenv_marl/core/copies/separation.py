@@ -26,6 +26,8 @@ from subprocess import Popen
 from threading import Thread
 from typing import Any, Final, Protocol
 
+import numpy as np
+
 from ...errors import BranchError
 from ..episodes.episode import Episode
 from ..switching.awaiting import LOOPS
@@ -62,8 +64,10 @@ class _Opening:
     descriptors: list[int]
 
 
-_SHARED: Final = re.compile(r"w.s \w+ \w+:\w+ \d+ +(/(?!dev/(?!shm/(?!sem\.)|zero)).*)")
-"""A writable mapping of shared memory: its path. Devices and semaphores do not count."""
+_SHARED: Final = re.compile(
+    r"(\w+)-(\w+) .w.s \w+ \w+:\w+ \d+ +(/(?!dev/(?!shm/(?!sem\.)|zero)).*)"
+)
+"""A writable mapping of shared memory: begin, end, path. Devices and semaphores do not count."""
 
 _shares_nothing = False  # since the latest look at the mappings, which takes half a millisecond
 
@@ -81,18 +85,31 @@ def _watch_mappings() -> None:
 
 
 def _shared_memory(episode: Episode) -> list[str]:
-    """Return the paths of memory that processes share, if the simulation holds some memory."""
+    """Return the paths of the memory that the simulation holds and processes share."""
     global _shares_nothing
     _watch_mappings()
     if _shares_nothing:
         return []
-    paths = _SHARED.findall(Path("/proc/self/maps").read_text(errors="replace"))
-    _shares_nothing = not paths
+    mappings = _SHARED.findall(Path("/proc/self/maps").read_text(errors="replace"))
+    _shares_nothing = not mappings
+    if _shares_nothing:
+        return []
     simulation = episode.simulation
     module = sys.modules.get(type(simulation).__module__)
     roots = [simulation, {} if module is None else vars(module), *episode.driver.variables()]
-    is_held = paths and next(find_objects(roots, (mmap,), set()), None) is not None
-    return paths if is_held else []
+    held = [_address_of(memory) for memory in find_objects(roots, (mmap,), set())]
+    return [
+        path
+        for begin, end, path in mappings
+        if any(int(begin, 16) <= address < int(end, 16) for address in held)
+    ]
+
+
+def _address_of(memory: Any) -> int:
+    """Return the address of a memory map; 0 if it is closed."""
+    with suppress(ValueError):
+        return np.frombuffer(memory, np.uint8).ctypes.data
+    return 0
 
 
 def separator_of(episode: Episode | None, method: str | None) -> Callable[[], None] | None:

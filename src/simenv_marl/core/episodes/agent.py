@@ -127,7 +127,7 @@ class Agent:
         answered: The number of its decisions that were answered.
         answered_at: The time of the latest answered decision.
         now: The time of the latest decision.
-        fallbacks: The number of its decisions that a fallback has answered.
+        counts: The numbers that policies have counted in its decisions, by name.
         fault: Why its rewards are wrong. Empty as far as is known.
     """
 
@@ -159,7 +159,7 @@ class Agent:
     answered: int = 0
     answered_at: float | None = None
     now: float | None = None
-    fallbacks: int = 0
+    counts: dict[str, float] = field(default_factory=dict)
     fault: str = ""
     _applying: int = 0
 
@@ -308,11 +308,10 @@ class Agent:
         """Undo ``begin_apply``."""
         self._applying -= 1
 
-    def count_fallback(self) -> None:
-        """Count a decision that a fallback has answered."""
-        self.fallbacks += 1
-
-    # -- who answers ------------------------------------------------------------------------------
+    def count(self, **numbers: float) -> None:
+        """Add numbers to its counts."""
+        for name, number in numbers.items():
+            self.counts[name] = self.counts.get(name, 0) + number
 
     def delegate(self, policy: Policy) -> None:
         """Let a policy answer from now on."""

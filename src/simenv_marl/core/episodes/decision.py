@@ -22,8 +22,8 @@ class DecidingAgent(Protocol):
     def validate(self, action: Action) -> Action:
         """Validate an action."""
 
-    def count_fallback(self) -> None:
-        """Count an answer of a fallback."""
+    def count(self, **numbers: float) -> None:
+        """Add numbers to its counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,6 @@ class Decision:
         """
         return self._agent.validate(action)
 
-    def count_fallback(self) -> None:
-        """Count an answer of a fallback. Evaluations show the number for each agent and seed."""
-        self._agent.count_fallback()
+    def count(self, **numbers: float) -> None:
+        """Add numbers to the counts of its agent, which ``Evaluation.seats`` shows by name."""
+        self._agent.count(**numbers)

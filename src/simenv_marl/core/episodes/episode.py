@@ -45,6 +45,7 @@ from ..plans.policies import (
     EpisodePolicy,
     Where,
     policy_for,
+    split_extras,
     two_arguments,
 )
 from ..switching.context import environment_context
@@ -382,6 +383,8 @@ class Episode(EpisodeState):
                     action = policy(observation, agent.info)
             finally:
                 self.consulted = None
+            if type(action) is tuple:
+                action, _ = split_extras(action, agent.point.definition.action_space)
         self.record(action)
         return action
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from copy import copy
 from functools import partial
 from numbers import Real
@@ -14,7 +14,16 @@ from typing import Any, Final, Protocol, TypeAlias
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
-from ...decision import DecisionPoint, Definition, inverse, parts_of, texts_of
+from ...decision import (
+    DecisionPoint,
+    Definition,
+    completed,
+    decisions_by_action,
+    inverse,
+    label_of,
+    parts_of,
+    texts_of,
+)
 from ...errors import (
     DefinitionError,
     InvalidActionError,
@@ -304,37 +313,52 @@ class Point:
     def action_labels(self, choices: Sequence[Model] | None, args: Args, kwargs: Kwargs) -> Labels:
         """Return the texts of the actions of a call. Default: choices, decisions or numbers."""
         definition = self.definition
-        decisions = inverse(definition) or {}
-        default = {action: str(decision) for decision, action in decisions.items()}
+        space = definition.action_space
+        values = decisions_by_action(definition.action_space_mapping) or {}
+        parts = parts_of(space)
         if choices is not None:
-            default = dict(enumerate(map(str, choices)))
-        labels = definition.action_labels or default or None
-        return self._labels("action_labels", labels, definition.action_space, args, kwargs)
+            values = dict(enumerate(choices))
+            parts = range(len(choices))
+        defaults = {action: label_of(value) for action, value in values.items()}
+        return self._labels("action_labels", space, parts, defaults, args, kwargs)
 
     def observation_labels(self, args: Args, kwargs: Kwargs) -> Labels:
         """Return the texts of the parts of an observation of a call."""
-        labels = self.definition.observation_labels
         space = self.definition.observation_space
-        return self._labels("observation_labels", labels, space, args, kwargs)
+        return self._labels("observation_labels", space, parts_of(space), {}, args, kwargs)
 
-    def _labels(self, name: str, labels: Model, space: Space, args: Args, kwargs: Kwargs) -> Labels:
-        """Return labels as a dict or a tuple, completed by numbers. None if a space has no labels.
+    def _labels(
+        self,
+        name: str,
+        space: Space,
+        parts: Collection[Any] | None,
+        defaults: Mapping[Any, str],
+        args: Args,
+        kwargs: Kwargs,
+    ) -> Labels:
+        """Return labels as a dict or a tuple, completed by others. None if a space has no labels.
 
-        ``labels`` may be a callable, which returns the labels of this call.
+        Args:
+            name: The part of the definition, which may be a callable of the call's arguments.
+            space: The space.
+            parts: Its parts with labels.
+            defaults: The labels of parts that have none. Further ones are numbers.
+            args: The arguments of the call.
+            kwargs: Its keyword arguments.
         """
-        if callable(labels):
+        labels = getattr(self.definition, name)
+        if name in self._calls:
             labels = self._calls[name](*args, **kwargs)
         # Labels of a Discrete may leave out the illegal actions of this call.
         texts = {} if labels is None else texts_of(space, labels, all_parts=False)
         if texts is None:
             raise DefinitionError(
                 f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
-                f" not texts for the parts of {short_repr(space)}"
+                f" not texts for the parts of {short_repr(space)}, all of them different"
             )
-        parts = parts_of(space)
         if parts is None:
             return None
-        named = {part: texts.get(part, str(part)) for part in parts}
+        named = completed(texts, {part: defaults.get(part, str(part)) for part in parts})
         has_keys = isinstance(space, (gym_spaces.Discrete, gym_spaces.Dict))
         return named if has_keys else tuple(named.values())
 

@@ -13,12 +13,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
+from time import perf_counter
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
+
+from gymnasium.spaces import Tuple
 
 from ...errors import OptionValueError, short_repr
 from ...simulation import RULE, Action, Observation, asks_for, positional
 from ..switching.awaiting import wait_for
-from .point import Policy
+from .point import Policy, Space
 
 Info: TypeAlias = dict[str, Any]
 Result = TypeVar("Result")
@@ -70,6 +73,9 @@ class AskedAgent(Protocol):
 
     def describe(self, seed: int, where: Where) -> object:
         """Return the decision of the agent, for a policy that asks for it."""
+
+    def count(self, **numbers: float) -> None:
+        """Add numbers to its counts."""
 
 
 ASKED: Final = ("_environment", "_decision", "_state")
@@ -199,6 +205,18 @@ def when_answered(
     return wait()
 
 
+def split_extras(answer: Action, space: Space | None = None) -> tuple[Action, Mapping[str, Any]]:
+    """Split the result of a policy into the action, or the actions, and the extras.
+
+    ``space``: the space of one action, because an action of a ``Tuple`` may look like both.
+    """
+    is_pair = type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping)
+    if is_pair and not (isinstance(space, Tuple) and space.contains(answer)):
+        action, extras = answer
+        return action, extras
+    return answer, {}
+
+
 class PolicyWrapper:
     """A policy that asks another policy, and so asks for the same arguments.
 
@@ -324,4 +342,13 @@ class AskingPolicy(EpisodePolicy):
             asked[ASKED[1]] = agent.describe(episode.seed, episode.where)
         if ASKED[2] in call.names:
             asked[ASKED[2]] = episode.read_state()
-        return call(observation, info, asked)
+        if not asked:  # a quick policy, as a rule
+            return call(observation, info, asked)
+        start = perf_counter()
+
+        def conclude(answer: Action) -> Action:
+            agent.count(seconds=perf_counter() - start)
+            return answer
+
+        answer = call(observation, info, asked)
+        return when_answered(answer, conclude) if self.waits else conclude(answer)

@@ -18,8 +18,9 @@ from ...core import Decision, Labels, Mask
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action, Observation
-from ..descriptions import JSON, MISFITS, labelled, legal_actions, to_action
-from ..policies import digest_of
+from ..answers import MISFITS, to_action
+from ..descriptions import JSON, labelled, legal_actions
+from ..recordings import digest_of
 
 Message = dict[str, Any]
 """A message between the page, the server and the game, or a part of one."""

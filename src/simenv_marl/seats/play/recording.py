@@ -16,7 +16,7 @@ from ...errors import (
     short_repr,
 )
 from ...simulation import Action, Model, Observation
-from ..policies import digest_of
+from ..recordings import digest_of
 from .forms import Message, action_of, jsonable
 
 

@@ -18,6 +18,7 @@ from ...core import (
     Policy,
     Where,
     portable,
+    split_extras,
     two_arguments,
 )
 from ...envs import SimulationAECEnv
@@ -106,4 +107,5 @@ def _answer(
         action = policy.answer(episode, agent, observation, agent.info)
     else:
         action = policy(observation, agent.info)
+    action, _ = split_extras(action, agent.point.definition.action_space)
     return None if action is RULE else jsonable(action)

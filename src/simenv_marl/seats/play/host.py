@@ -464,7 +464,7 @@ class Host:
             "pending": self._pending(),
             "over": game.over,
             "ending": ENDS.get(game.over, f"The game cannot go on: {game.over}"),
-            "returns": game.returns,
+            "returns": {**game.returns},
             "history": [self._past(row) for row in decided[-MOST_ROWS:]],
             "views": self._views(rows),
             "courses": self._courses(seats) if game.over else {},

@@ -86,7 +86,8 @@ class Link:
         self._ready = asyncio.Event()
 
     def send(self, kind: str, text: str) -> None:
-        """Send a message soon."""
+        """Send a message soon, after all that wait."""
+        self._outbox.pop(kind, None)
         self._outbox[kind] = text
         self._ready.set()
 

@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from math import floor, log10
 from threading import Lock, Thread
 from typing import Any, Final, NamedTuple
 
@@ -162,9 +163,10 @@ class Horizon:
             self.decisions = int(length)
 
     def learn(self, span: float) -> None:
-        """Take the time of a future, in one digit."""
+        """Take the time of a future, rounded down to one digit."""
         if self.time is None and span > 0:
-            self.time = float(f"{span:.0e}")
+            unit = 10.0 ** floor(log10(span))
+            self.time = float(f"{floor(span / unit) * unit:.0e}")
 
 
 class Futures(Exploration):

@@ -175,9 +175,11 @@ class Game:
             self._record({"back": True, "turn": self.turn})
 
     def _header(self) -> Message:
-        header = {"simulation": self.name, "seed": self.seed, "seats": list(self.seats)}
-        options = {"skip_forced", "max_steps"} & self.options.keys()
-        return header | {name: self.options[name] for name in options}  # type: ignore[literal-required]
+        header: Message = {"simulation": self.name, "seed": self.seed, "seats": list(self.seats)}
+        for name, value in self.options.items():
+            if name in ("skip_forced", "max_steps"):
+                header[name] = value
+        return header
 
     def _begin(self, seed: int) -> None:
         self.forget(-1)

@@ -124,7 +124,8 @@ class Game:
                 f"there is no agent {seat!r}; the agents are {agents}{did_you_mean(seat, agents)}"
             )
         self.agents: dict[str, str] = {}
-        for agent in dict.fromkeys([*self.seats, *agents]):
+        named = [key for key in self.policies if isinstance(key, str) and "." not in key]
+        for agent in dict.fromkeys([*self.seats, *agents, *named]):
             point = roster.get(agent)
             self._meet(agent, "" if point is None else point.hook.name)
         self.recorder = None if self.record is None else Recorder(self.record)

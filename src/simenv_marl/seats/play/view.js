@@ -20,12 +20,12 @@ export function drawPage(touched) {
   const ready = state && !page.stranger && (!page.key || page.seat !== null);
   document.querySelector("main").hidden = !ready;
   if (!ready) { $("status").textContent = page.stranger || (page.lost ? "The connection is lost. Trying again …" : "Connecting …"); return; }
+  document.querySelector("main").inert = isDead();
+  document.body.classList.toggle("dead", isDead());
   for (const part of [drawHead, drawStatus, drawClock, drawLobby]) part();
   for (const id of ["decision", "end", "more"]) $(id).hidden = inLobby();
   if (inLobby()) return;
   for (const part of [drawDecision, drawFutures, drawEnd, drawLatest, drawPicture, drawTools, drawPast]) part(touched);
-  document.querySelector("main").inert = isDead();
-  document.body.classList.toggle("dead", isDead());
 }
 
 // -- the head ------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ function drawDecision(touched) {
     answers = new Answers(pending.form, mine() ? pending.last : null, mine(), touched);
     $("problem").hidden = !state.notice;
     delete $("problem").dataset.error;
-    focusFirst();
+    setTimeout(focusFirst); // until then, the page is inert
   }
   if (!seen) answers = null;
   drawn = decision;
@@ -141,7 +141,7 @@ export function drawDecide() {
 }
 
 function focusFirst() {
-  const input = answers.fields[0]?.input;
+  const input = answers?.fields[0]?.input;
   const rests = document.activeElement === document.body || !document.activeElement.isConnected
     || $("decision").contains(document.activeElement);
   if (input && mine() && rests) { input.focus({ preventScroll: true }); input.select?.(); }

@@ -6,11 +6,19 @@ from queue import SimpleQueue
 from threading import Thread
 
 import pytest
+from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import SimulationInterface, aec_env, parallel_env, single_env
+from simenv_marl import SimulationInterface, aec_env, generate_env, parallel_env, single_env
 from simenv_marl.core.plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions
-from simenv_marl.errors import DefinitionError, NoDecisionError, did_you_mean
+from simenv_marl.errors import (
+    AgentError,
+    DefinitionError,
+    NoDecisionError,
+    UnknownOptionError,
+    ViewError,
+    did_you_mean,
+)
 from tests.worlds.copied import Walk
 from tests.worlds.models import define
 
@@ -25,6 +33,9 @@ class Model(SimulationInterface):
     def choose(self):
         return 0
 
+    def tell(self):
+        return 0
+
 
 class Derived(Model):
     """Overrides what a point of the base class names."""
@@ -34,6 +45,30 @@ class Derived(Model):
 
 
 CHOOSE = f"{__name__}.Model.choose"
+TELL = f"{__name__}.Model.tell"
+
+
+@pytest.mark.parametrize(
+    ("view", "part", "space", "match"),
+    [
+        ("turn", "observation", spaces.Sequence(spaces.Discrete(2)), f"the space of {TELL},"),
+        ("turn", "action", spaces.Box(0, float("inf")), f"finite.*the space of {TELL},"),
+        ("turn", "action", spaces.MultiBinary(2), f"a Box, not .*the space of {TELL},"),
+        ("joint", "action", spaces.MultiBinary(2), r"not MultiBinary\(2\) of 'tell_0'"),
+    ],
+)
+def test_a_view_names_the_point_whose_space_prevents_it(view, part, space, match):
+    points = {CHOOSE: define(), TELL: define(**{f"{part}_space": space})}
+    with pytest.raises(ViewError, match=match):
+        generate_env(Model, points, view=view, flatten=True)()
+
+
+def test_one_agent_of_several_needs_the_single_view():
+    points = {CHOOSE: define(agent=lambda model: "a"), TELL: define(agent=lambda model: "b")}
+    with pytest.raises(AgentError, match="other views take no agent="):
+        generate_env(Model, points, view="turn", agent="a")
+    with pytest.raises(UnknownOptionError, match=r"the single view only; .*policies="):
+        generate_env(Model, {CHOOSE: define()}, view="turn", agent="choose_0")
 
 
 @pytest.mark.parametrize(

@@ -35,13 +35,13 @@ def train(seed: int, steps: int = STEPS) -> Policies:
     """Train with the team's reward."""
     learner = PPO(
         "MlpPolicy",
-        make_vec_env(make, n_envs=8),
-        n_steps=600,
-        batch_size=200,
+        make_vec_env(make, n_envs=16),
+        n_steps=300,
+        batch_size=600,
         gamma=0.98,
-        gae_lambda=0.95,
-        learning_rate=lambda left: 2e-3 * left,
-        policy_kwargs={"log_std_init": -1.5},
+        gae_lambda=0.9,
+        learning_rate=lambda left: 3e-3 * left,
+        policy_kwargs={"log_std_init": -0.7},
         seed=seed,
     )
     learner.learn(steps)

@@ -536,6 +536,13 @@ class Counted:
         return print(text) if mode == "human" else text
 
 
+class Ragged(Counted):
+    """Its state is no array."""
+
+    def state(self):
+        return [[1], [1, 2]]
+
+
 @EVERY_VIEW
 def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
@@ -563,8 +570,9 @@ def test_states_that_cannot_be_are_refused():
             lambda: Counted(ant),
             {"state_space": spaces.Box(-9, 9, (3,))},
             ObservationError,
-            "the observation has shape",
+            "the state has shape",
         ),
+        (lambda: Ragged(ant), {}, ObservationError, "has returned an illegal value: setting"),
         (calling(ant), {}, NotImplementedError, None),
     ):
         env = parallel_env(make, ant, **options)

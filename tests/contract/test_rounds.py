@@ -8,7 +8,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, branch, parallel_env
+from simenv_marl import RULE, branch, joint_env, parallel_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     ClosedError,
@@ -195,6 +195,38 @@ def test_choices_may_be_used_up_at_the_end():
     assert left == env.agents == []
     assert infos["ant_0"]["action_mask"].tolist() == [1, 1]
 
+
+@pytest.mark.parametrize(
+    "legal",
+    [
+        {"choices": lambda: HAND, "action_space": spaces.Discrete(2)},
+        {"action_mask_mapping": lambda: [bool(HAND)] * 10},
+    ],
+    ids=["choices", "mask"],
+)
+@pytest.mark.parametrize("make", [parallel_env, joint_env])
+def test_there_may_be_no_legal_action_between_decisions(make, legal):
+    def main(simulation):
+        for _ in range(3):
+            HAND.extend("xy")
+            simulation.log.append(bee())
+            HAND.clear()
+            ant()
+            ant()
+
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **legal)
+    env = make(script(main), [bee, ant])
+    env.reset()
+    *_, info = env.step({"ant_0": RULE, "bee_0": 1} if make is joint_env else {"bee_0": 1})
+    mask = info["action_mask"]["bee_0"] if make is joint_env else info["bee_0"]["action_mask"]
+    assert mask.all()
+    for _ in range(5):
+        env.step(RULE)
+    assert env.simulation.log == ["y" if "choices" in legal else 1, "rule", "rule"]
+    HAND.clear()
+
+
+HAND: list[str] = []
 
 # -- births and deaths ----------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import aec_env, clone, parallel_env, simulate, single_env, turn_env
+from simenv_marl import RULE, aec_env, clone, parallel_env, simulate, single_env, turn_env
 from simenv_marl.errors import AgentError, NoDecisionError
 from tests.worlds.models import calling, decision, define, play, script
 
@@ -80,6 +80,25 @@ def test_an_entity_with_two_kinds_of_decisions_is_one_agent():
     assert sum(turn.reward for turn in turns if turn.agent == "bob") == 6.0
 
 
+class Announcing(Ward):
+    """Announces both decisions of all nurses."""
+
+    def expected_calls(self, point: str) -> list[tuple[Nurse]]:
+        return [(nurse,) for nurse in self.nurses]
+
+
+def test_who_is_announced_at_another_point_decides_where_it_is():
+    shifted = points(action_space_mapping=lambda action: action + 1)
+    env = aec_env(Announcing, shifted)
+    play(env, 0)
+    assert env.simulation.log == EXPECTED
+    env = parallel_env(Announcing, shifted)
+    env.reset()
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, 0))
+    assert env.simulation.log == EXPECTED
+
+
 def test_agents_with_one_name_share_a_string():
     ant, other = decision(agent="ant_0"), decision(agent="ant_0")
     for make in (aec_env, parallel_env):
@@ -122,6 +141,22 @@ def test_different_spaces_need_the_turn_view():
         ended = terminated or truncated
     assert turn.simulation.log == EXPECTED
     assert total == 10.0
+
+
+def test_the_state_has_one_part_for_an_agent_with_two_kinds_of_observations():
+    make = points(observation_space=spaces.Discrete(3), observation_space_mapping=lambda nurse: 2)
+    names = {point: ["ann", "bob"] for point in make}
+    given = {"possible_agents": names, "state_space": "observations", "state_in_info": True}
+    env = turn_env(Ward, make, **given)
+    _, info = env.reset()
+    states = [info["state"].tolist(), *(env.step(RULE)[-1]["state"].tolist() for _ in range(3))]
+    assert env.state_space.shape == (6,)
+    assert states == [
+        [0, 0, 0, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 1],
+    ]
 
 
 # -- births ---------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from simenv_marl import (
 )
 from simenv_marl.errors import OptionValueError, RewardError
 from tests.worlds import random_worlds as yards
-from tests.worlds.models import calling, decision, play, script
+from tests.worlds.models import calling, decision, define, play, script
 
 CLOSE = {"rel": 1e-9, "abs": 1e-6}
 
@@ -87,6 +87,15 @@ def test_rounds_pay_each_live_agent_what_the_round_has_earned():
     env = joint_env(calling(ant, bee, ant, bee), [ant, bee], team_reward=Counter(100, 1, 2))
     env.reset()
     assert [env.step({"ant_0": 1, "bee_0": 1})[1] for _ in range(2)] == [1.0, 2.0]
+
+
+def test_items_of_split_calls_earn_the_teams_reward():
+    bid = define(split=lambda items: items, agent=lambda item: item)(lambda items: items)
+    env = turn_env(
+        script(lambda simulation: bid(["ant", "bee"])), bid, team_reward=Counter(100, 1, 2)
+    )
+    env.reset()
+    assert [env.step(0)[1] for _ in range(2)] == [1.0, 2.0]
 
 
 def test_a_reward_that_is_no_number_is_refused():

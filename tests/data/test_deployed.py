@@ -127,6 +127,28 @@ def test_a_batched_turn_policy_gets_stacks():
     assert max(sizes) > 1
 
 
+def test_masks_of_several_numbers_reach_turn_policies():
+    several = {
+        "agent": lambda: "ant_0",
+        "action_space": spaces.MultiDiscrete([2, 3]),
+        "action_space_mapping": lambda action: action.tolist(),
+    }
+    ant = decision(action_mask_mapping=lambda: ([0, 1], [0, 0, 1]), **several)
+    env = turn_env(calling(ant), [ant])
+    one = turn_policy(
+        lambda seen, info: np.array([m.argmax() for m in info["action_mask"]]), like=env
+    )
+    many = turn_policy(
+        lambda seen, info: np.stack([m.argmax(1) for m in info["action_mask"]], 1),
+        like=env,
+        batched=True,
+    )
+    assert env.reset()[1]["action_mask"][1].tolist() == [0, 0, 1]
+    for policies in (one, many):
+        (found,) = simulate_many(calling(ant), policies, points=[ant], seeds=[0])
+        assert found.log == [[1, 2]]
+
+
 def test_a_joint_policy_decides_in_rounds_as_in_its_environment():
     for flatten in (False, True):
         env = joint_env(Bakery, POINTS, possible_agents=ROSTER, flatten=flatten)
@@ -188,6 +210,7 @@ def test_beside_one_agent_a_turn_policy_answers_all_others():
         observation, _, terminated, truncated, info = single.step(action)
         ended = terminated or truncated
     assert single.simulation.trace == expected
+    assert [*single.provenance()["policies"].values()] == ["<TurnPolicy: predict>"]
     with pytest.raises(OptionValueError, match="agent="):
         turn_env(Bakery, POINTS, policies=policies)
 

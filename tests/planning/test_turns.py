@@ -7,7 +7,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TransformAction, TransformReward
 
-from simenv_marl import RULE, branch, clone, turn_env
+from simenv_marl import RULE, branch, clone, generate_env, joint_env, simulate, turn_env
+from simenv_marl.data import joint_policy, turn_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, UnknownAgentError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
 from tests.planning.test_action_values import METHODS, begun, futures_of
@@ -103,6 +104,46 @@ def test_a_base_by_agent_sees_and_acts_as_the_agents_do(method):
     env = begun(TransformAction(made(), lambda action: action, spaces.Discrete(2)))
     with pytest.raises(OptionValueError, match="no wrapper has replaced"):
         action_values(env, base=bases)
+
+
+def paced(seen):
+    return int(seen[0]) % 3
+
+
+@pytest.mark.parametrize("view", ["turn", "aec", "parallel", "joint"])
+def test_a_base_for_all_agents_decides_as_bases_by_agent_do(view):
+    bases = [
+        dict.fromkeys(("left", "right"), paced),
+        turn_policy(lambda seen: paced(seen["observation"]), like=made()),
+        joint_policy(
+            lambda seen: {name: paced(part) for name, part in seen.items()},
+            like=joint_env(Duel, points()),
+        ),
+    ]
+    env = begun(generate_env(Duel, points(), view=view)())
+    actions = [{"left": 2, "right": 0}] if view == "joint" else [0, 2]
+    table = [action_values(env, actions, base=base, futures=2).returns for base in bases]
+    if view == "joint":
+        env = begun(joint_env(Duel, points(), flatten=True))
+        base = joint_policy(lambda seen: (np.repeat(paced(seen), 2), {}), like=env)
+        table.append(action_values(env, [np.array([2, 0])], base=base, futures=2).returns)
+    assert table == [pytest.approx(table[0])] * len(table)
+
+
+def test_policies_that_plan_take_bases_for_all_agents():
+    turn = turn_policy(lambda seen: paced(seen["observation"]), like=made())
+    values = []
+    for base in (dict.fromkeys(("left", "right"), paced), turn, turn | {"right": RULE}):
+
+        def plan(seen, *, _environment, base=base):
+            values.append(action_values(_environment, [0, 2], base=base, futures=2).means.tolist())
+            return RULE
+
+        simulate(Duel, {"left": plan}, points=points(), seed=5)
+    by_agent, by_all, by_some = np.reshape(values, (3, -1))
+    assert by_all == pytest.approx(by_agent)
+    assert by_some != pytest.approx(by_agent)
+    assert TreeSearchPolicy([0, 2], base=turn, futures=4).choose(made()).means.all()
 
 
 @ONE_FUTURE

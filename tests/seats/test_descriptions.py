@@ -37,6 +37,7 @@ def test_a_pending_decision_is_described_in_words():
     env.step(RULE)
     assert describe(env).splitlines() == [
         "filler decides (decision 2, time 1).",
+        "By its rule: Choose how much water flows in.",
         "Observation:",
         f"- level: {env.observe('filler')[0]!s}",
         f"Reward of the previous action: {env.unwrapped.simulation.level!r}",
@@ -54,10 +55,18 @@ def test_it_is_described_as_json():
         "point": "tests.seats.tank.Tank.fill",
         "number": 1,
         "time": 0.0,
+        "question": "By its rule: Choose how much water flows in.",
         "observation": {"level": 5.0},
         "actions": {"type": "string", "enum": ["closed", "half", "open"]},
         "reward": 0.0,
     }
+
+
+def test_a_question_and_a_display_are_described_in_place_of_rule_and_observation():
+    env = env_of(replace(FILL, question="How much?", display_mapping=lambda tank: {"m": "5 of 9"}))
+    assert describe(env).splitlines()[1:4] == ["How much?", "Observation:", "- m: 5 of 9"]
+    found = describe(env, as_json=True)
+    assert (found["question"], found["observation"]) == ("How much?", {"m": "5 of 9"})
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
@@ -381,7 +390,7 @@ def test_numbers_lose_no_digit_that_matters(dtype, lines):
         observation_space_mapping=lambda tank: [16777217.5, 0.1, 1 / 3, 2.0],
         observation_labels=list("abcd"),
     )
-    assert describe(env_of(definition)).splitlines()[2:6] == lines
+    assert describe(env_of(definition)).splitlines()[3:7] == lines
 
 
 def test_timelines_name_actions_by_their_labels():

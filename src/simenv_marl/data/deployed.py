@@ -26,7 +26,7 @@ from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..envs.base import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
-from ..errors import OptionValueError, UnknownAgentError, short_repr
+from ..errors import OptionValueError, UnknownAgentError, name_of, short_repr
 from ..many.batch import read_answers
 from ..simulation import EVERYONE, RULE
 
@@ -111,6 +111,9 @@ class _Deployed(EpisodePolicy):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.policy, self._plan)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {name_of(self.policy)}>"  # also in provenance
+
     def _ask(
         self, observation: Observation, info: Info, space: Any, state: object
     ) -> tuple[Action, Any]:
@@ -154,9 +157,15 @@ class TurnPolicy(_Deployed):
         told: Info = {"agent": [agent.name for agent in agents]}
         if all("time" in info for info in infos):
             told["time"] = np.array([info["time"] for info in infos])
-        if self._turn.has_masks:
-            masks: list[Any] = [self._turn.mask(agent) for agent in agents]
-            told[MASK] = np.stack(masks)
+        masks: list[Any] = [self._turn.mask(agent) for agent in agents]
+        if any(mask is not None for mask in masks):
+            for place, agent in enumerate(agents):
+                if masks[place] is None:
+                    masks[place] = agent.point.open_mask()
+            if isinstance(masks[0], tuple):
+                told[MASK] = tuple(map(np.stack, zip(*masks, strict=True)))
+            else:
+                told[MASK] = np.stack(masks)
         answers = self._ask(seen, told, self._turn.action_space, states)
         actions, extras = read_answers(answers, self.policy, len(agents))
         return list(map(self._own, agents, actions)), extras
@@ -164,8 +173,9 @@ class TurnPolicy(_Deployed):
     def _info(self, agent: Agent, info: Info) -> Info:
         """Return the info of a decision. Times since the last step are not known here."""
         told: Info = {"agent": agent.name}
-        if self._turn.has_masks:
-            told[MASK] = self._turn.mask(agent)
+        mask = self._turn.mask(agent)
+        if mask is not None:
+            told[MASK] = mask
         if "time" in info:
             told["time"] = info["time"]
         return told
@@ -182,11 +192,11 @@ class JointPolicy(_Deployed):
 
     def __init__(self, predict: Predict, plan: Plan) -> None:
         super().__init__(predict, plan)
-        self._joint: Joint = plan.derive(Joint)
+        self.joint: Joint = plan.derive(Joint)
 
     def respond(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Any:
         """Answer one decision with the agent's action of the round. Begin another without one."""
-        if agent.name not in self._joint.roster:
+        if agent.name not in self.joint.roster:
             raise UnknownAgentError(
                 f"{agent.name!r} is no agent of the joint view in which the policy was trained"
             )
@@ -199,15 +209,21 @@ class JointPolicy(_Deployed):
 
     def _begin_round(self, episode: Episode, deciding: Agent) -> dict[str, Action]:
         """Ask for the actions of all live agents, and return them."""
+        answer = self.answer_all(episode, deciding)
+        found = {name: episode.find(name) for name in self.joint.roster}
+        live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
+        actions = self.joint.actions(live, answer)
+        episode.memory[self] = actions
+        return actions
+
+    def answer_all(self, episode: Episode, deciding: Agent) -> Action:
+        """Answer with the joint action. ``deciding``: the agent whose decision is pending."""
         episode.observe_others(deciding)
-        found = {name: episode.find(name) for name in self._joint.roster}
-        seen, told = self._joint.see(list(found.values()))
+        found = {name: episode.find(name) for name in self.joint.roster}
+        seen, told = self.joint.see(list(found.values()))
         unused = episode.memory.get(self, found)
         told["deciding"] = deciding.name
         told["acted"] = {name: name not in unused for name in found}
         state = episode.read_state() if self.takes_state else None
-        answer, _ = self._ask(seen, told, self._joint.action_space, state)
-        live = {name: agent for name, agent in found.items() if agent is None or not agent.ended}
-        actions = self._joint.actions(live, answer)
-        episode.memory[self] = actions
-        return actions
+        answer, _ = self._ask(seen, told, self.joint.action_space, state)
+        return answer

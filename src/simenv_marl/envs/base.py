@@ -7,12 +7,7 @@ import pickle
 import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import (
-    Any,
-    Self,
-    TypeAlias,
-    TypeVar,
-)
+from typing import Any, Self, TypeAlias, TypeVar
 from zlib import crc32
 
 import gymnasium as gym
@@ -60,11 +55,11 @@ StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
 _OWN_OPTIONS = {
-    "agent": "the single view",
-    "flatten": "joint and turn views",
-    "state_in_info": "joint and turn views",
+    "agent": "the single view only; elsewhere, policies={name: RULE} leaves an agent to its rule",
+    "flatten": "joint and turn views only",
+    "state_in_info": "joint and turn views only",
 }
-"""The options that not every view takes."""
+"""The options that not every view takes, and the views that take them."""
 
 _NOT_COPIED = frozenset(
     ("_finalizer", "_lock", "_roster", "joint", "own_agent", "own_seat", "session", "turn")
@@ -149,7 +144,7 @@ class View:
         """Check that a plan allows this view, and return the plan of its sessions."""
         for option, views in _OWN_OPTIONS.items():
             if getattr(plan.options, option) and option not in cls._own_options:
-                raise UnknownOptionError(f"{option} is an option of {views} only")
+                raise UnknownOptionError(f"{option} is an option of {views}")
         for point in plan.active:
             first = plan.roster.get(point.agent or "", point)
             if not plan.can_share(point, first):

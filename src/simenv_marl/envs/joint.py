@@ -1,6 +1,6 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -50,14 +50,14 @@ class Joint:
             return
         flat = {name: _flat(space) for name, space in observations.items()}
         self._flat_observations = {name for name in flat if flat[name] is not observations[name]}
-        self.observation_space = _concatenate(flat.values())
+        self.observation_space = _concatenate(flat)
         # Where agents with a Discrete stand beside agents with a Box.
         self._codes: dict[str, ActionCode] = {}
         if any(isinstance(space, spaces.Box) for space in actions.values()):
             for name, space in actions.items():
                 if isinstance(space, spaces.Discrete):
                     actions[name], self._codes[name] = preferences(space)
-        self.action_space = _concatenate(actions.values(), discrete=True)
+        self.action_space = _concatenate(actions, discrete=True)
         # The index of each agent's action in the flattened one.
         self._places: dict[str, int | slice] = {}
         begin = 0
@@ -257,8 +257,9 @@ def _flat(space: Space) -> Space:
     return spaces.flatten_space(space) if isinstance(space, spaces.Discrete) else space
 
 
-def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
+def _concatenate(named: Mapping[str, Any], *, discrete: bool = False) -> Space:
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
+    parts = named.values()
     kinds = (spaces.Discrete, spaces.MultiDiscrete)
     if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):
         sizes = [
@@ -267,10 +268,10 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
         starts = [np.atleast_1d(space.start) for space in parts]
         return spaces.MultiDiscrete(np.concatenate(sizes), start=np.concatenate(starts))
     # A Discrete comes last, because it may stand beside vectors.
-    for space in sorted(parts, key=lambda part: isinstance(part, spaces.Discrete)):
+    for name, space in sorted(named.items(), key=lambda item: isinstance(item[1], spaces.Discrete)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
                 "flatten=True needs one-dimensional Box and Discrete spaces, or actions that are"
-                f" all discrete, not {space}"
+                f" all discrete, not {space} of {name!r}"
             )
     return spaces.flatten_space(spaces.Tuple(parts))

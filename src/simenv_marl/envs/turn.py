@@ -26,7 +26,7 @@ from ..core import (
     common_observations,
 )
 from ..decision import DecisionPoint
-from ..errors import ViewError, short_repr
+from ..errors import ViewError, listed
 from ..simulation import RULE
 from .agents import refuse_unknown_agents
 from .base import OneAgentView, StepResult
@@ -65,7 +65,6 @@ class Turn:
     Attributes:
         observation_space, action_space: The spaces of the learner.
         translates: Whether the learner's actions differ from those of the agents.
-        has_masks: Whether infos have masks of its actions.
         is_plain: Whether results are the agents' own ones, with the kind, the name and the mask.
         seats: The seats by decision point.
     """
@@ -74,16 +73,19 @@ class Turn:
         """Unite the spaces of the active points, or raise ``ViewError`` if that is not possible."""
         options = plan.options
         definitions = [point.definition for point in plan.active]
-        common, encoders = common_observations([each.observation_space for each in definitions])
+        seen = [each.observation_space for each in definitions]
         actions = [each.action_space for each in definitions]
-        self.action_space, codes = common_actions(actions, clips=options.clip_actions)
+        try:
+            common, encoders = common_observations(seen)
+            self.action_space, codes = common_actions(actions, clips=options.clip_actions)
+        except ViewError as error:
+            raise _explained(error, plan) from None
         self.translates = any(space != self.action_space for space in actions)
         hooks = [point.hook for point in plan.active]
         kinds = map(np.int64, range(len(hooks)))
         masks = [code.widen(None) for code in codes]
         renewing = [None if mask is None else np.asarray(mask).copy for mask in masks]
         self.seats = _Seats(zip(hooks, map(Seat, kinds, encoders, codes, renewing), strict=True))
-        self.has_masks = any(mask is not None for mask in masks)
         parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
         self._indices: dict[str, np.int64] = {}
         if options.possible_agents is not None:
@@ -100,10 +102,8 @@ class Turn:
         if options.flatten:
             self.observation_space = spaces.flatten_space(self._whole)
             if not isinstance(self.observation_space, spaces.Box):
-                raise ViewError(
-                    "flatten=True needs observation spaces that can be flattened, not"
-                    f" {short_repr(common)}"
-                )
+                problem = f"flatten=True needs observations that can be flattened, not {common}"
+                raise _explained(ViewError(problem), plan)
 
     def observe(self, agent: Agent) -> Observation:
         """Return an agent's latest observation as one of the learner."""
@@ -140,6 +140,20 @@ class Turn:
             ]
             self._beginnings[key] = np.concatenate(parts).astype(self.observation_space.dtype)
         return self._beginnings[key]
+
+
+def _explained(error: ViewError, plan: Plan) -> ViewError:
+    """Add the decision points whose space an error names."""
+    names = [
+        point.hook.name
+        for point in plan.active
+        for space in (point.definition.observation_space, point.definition.action_space)
+        if f" {space}" in str(error)
+    ]
+    return ViewError(
+        f"{error}; it is the space of {listed(names)}, which needs another one, or an answer by"
+        " policies="
+    )
 
 
 class SimulationTurnEnv(OneAgentView):

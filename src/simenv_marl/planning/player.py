@@ -33,6 +33,7 @@ from ..core import (
     split_extras,
     two_arguments,
 )
+from ..data.deployed import JointPolicy
 from ..envs import (
     SimulationAECEnv,
     SimulationEnv,
@@ -48,7 +49,7 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
-from ..simulation import RULE, Action, Observation
+from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel
 
 Environment: TypeAlias = (
     Env[Observation, Action]
@@ -86,12 +87,12 @@ class Player:
         self.base = base
         self.over = False
         self.latest: dict[str, tuple[Observation, Info]] = {}
-        self._policies: dict[str, Policy] = {}
+        self._policies: dict[str | Sentinel, Policy] = {}
         bases = base if isinstance(base, Mapping) else {self.name: base}
         for each in bases:
             policy = policy_for(bases, each, Where.PLAN)
-            if policy is not RULE:
-                self._policies[each] = two_arguments(policy)
+            self._policies[each] = policy if policy is RULE else two_arguments(policy)
+        self._everyone = self._policies.get(EVERYONE, RULE)
 
     # -- checks, before anything moves ------------------------------------------------------------
 
@@ -170,7 +171,7 @@ class Player:
         if not isinstance(self.base, Mapping):
             return
         for name in self.base:
-            if not self.episode.may_have(name):
+            if name is not EVERYONE and not self.episode.may_have(name):
                 known = [
                     *self.episode.agents,
                     *self.episode.others,
@@ -212,10 +213,15 @@ class Player:
         """Return the agent's action by its base."""
         return self._decide_for(self.name)
 
+    def replace_decision(self) -> None:
+        """Let a candidate take the place of the base's action, which a round includes, too."""
+        if isinstance(self._everyone, EpisodePolicy) and self._everyone.sees_all:
+            self.decide()
+
     def _decide_for(self, name: str) -> Action:
         """Return an agent's action by its base."""
-        policy = self._policies.get(name)
-        if policy is None:
+        policy = self._policies.get(name, self._everyone)
+        if policy is RULE:
             return RULE
         observation, info = self._observe(name)
         agent = self.episode.agents.get(name, self.agent)
@@ -323,7 +329,12 @@ class JointPlayer(Player):
         super().__init__(env, base, "all agents")
         observation = self.view.joint.read(self.episode, None)[0]
         self.latest = {self.name: (observation, {})}
-        if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
+        space = self.view.action_space
+        policy = self._everyone
+        self._learner: JointPolicy | None = None
+        if isinstance(policy, JointPolicy) and policy.joint.action_space == space:
+            self._learner = policy
+        elif isinstance(base, Mapping) and not isinstance(space, spaces.Dict):
             raise OptionValueError(
                 "a base by agent needs a joint view without flatten=True; pass one policy for all"
                 " agents"
@@ -344,6 +355,8 @@ class JointPlayer(Player):
 
     def decide(self) -> Action:
         """Return the actions of all agents by the base."""
+        if self._learner is not None:
+            return self._learner.answer_all(self.episode, self.episode.pending or self.agent)
         if not isinstance(self.base, Mapping):
             return super().decide()
         agents = self.episode.agents
@@ -365,7 +378,7 @@ class TurnPlayer(Player):
     ) -> None:
         super().__init__(env, base, "all agents")
         info: Info = {"agent": self.agent.name}
-        if self.view.turn.has_masks:
+        if self.mask is not None:
             info[MASK] = self.mask
         self.latest = {self.name: (self.view.turn.observe(self.agent), info)}
         if isinstance(base, Mapping) and self._space_of(self.name) != self.view.action_space:
@@ -464,6 +477,7 @@ class ParallelPlayer(Player):
                 actions[name] = self._decide_for(name)
         observations, rewards, terminations, truncations, infos = self._step_env(actions, self.name)
         self.latest = {name: (observations[name], infos[name]) for name in observations}
+        self.episode.memory.clear()  # policies for all agents answer each round anew
         over = terminations.get(self.name, True) or truncations[self.name]
         self.over = over or self.agent.ended  # pad_agents keeps ended agents
         return float(rewards.get(self.name, 0.0))

@@ -122,6 +122,7 @@ def try_out(
                 break
             if decision == 0 or (decision < len(path) and player.allows(path[decision])):
                 action = path[decision]
+                player.replace_decision()
             else:
                 action = player.decide()
             rewards.append(weight * player.step(action))
@@ -240,9 +241,10 @@ def action_values(
         actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
             ``Discrete``.
         base: The policy that decides after the candidate: ``RULE``, a callable of the observation,
-            or of the observation and the info, or a dict of these by agent. Other agents of the
-            environment follow their entry in the dict, else their rule. Agents in the option
-            ``policies`` keep their policies. A planner is replaced by its attribute ``base``.
+            or of the observation and the info, a dict of these by agent, or the policies of
+            ``turn_policy`` or ``joint_policy``. Other agents of the environment follow their entry
+            in the dict, else their rule. Agents in the option ``policies`` keep their policies. A
+            planner is replaced by its attribute ``base``.
         futures: The number of futures in which each candidate is tried.
         horizon: The number of the agent's decisions whose rewards count, including the candidate.
             With ``horizon_by="time"``: a duration; rewards count up to the agent's first decision

@@ -43,15 +43,17 @@ def describe(
 ) -> Any:
     """Describe the pending decision.
 
-    The description has the agent, the time, its observation, its legal actions, and the reward of
-    its previous action.
+    The description has the agent, the time, the question, the situation, the legal actions, and the
+    reward of the previous action. The situation is the observation, or the ``display_mapping`` of
+    ``make_step`` where there is one.
 
     Args:
         env_or_decision: An environment in mid-episode, with or without wrappers; or the
             ``Decision`` that a policy receives as ``_decision``.
         as_json: Whether to return a dict for ``json.dumps`` instead of a text. Its keys are
-            ``agent``, ``point``, ``number``, ``time``, ``observation``, ``actions`` and ``reward``;
-            ``actions`` is a JSON schema of the answers that ``parse`` takes.
+            ``agent``, ``point``, ``number``, ``time``, ``question``, ``observation``, ``actions``
+            and ``reward``; ``observation`` is the situation, and ``actions`` a JSON schema of the
+            answers that ``parse`` takes.
 
     Raises:
         ResetNeededError: No decision is pending.
@@ -89,8 +91,9 @@ def _as_text(decision: Decision) -> str:
     return "\n".join(
         [
             f"{decision.agent} decides (decision {decision.number}{time}).",
+            *filter(None, [decision.question]),
             "Observation:",
-            *_observation_lines(labelled(decision.observation, decision.observation_labels)),
+            *_observation_lines(situation(decision)),
             f"Reward of the previous action: {_value_text(decision.reward)}",
             "Legal actions:",
             *legal_lines(decision),
@@ -104,13 +107,21 @@ def _as_json(decision: Decision) -> dict[str, JSON]:
         "point": decision.point,
         "number": decision.number,
         "time": decision.time,
-        "observation": labelled(decision.observation, decision.observation_labels),
+        "question": decision.question,
+        "observation": situation(decision),
         "actions": action_schema(decision),
         "reward": decision.reward,
     }
 
 
 # -- observations ---------------------------------------------------------------------------------
+
+
+def situation(decision: Decision) -> JSON:
+    """Return the display of a decision, or else its observation, as JSON with labels."""
+    if decision.display is None:
+        return labelled(decision.observation, decision.observation_labels)
+    return {label: labelled(value) for label, value in decision.display.items()}
 
 
 def labelled(value: Observation, labels: Labels = None) -> JSON:
@@ -154,6 +165,8 @@ def _observation_lines(observation: JSON) -> list[str]:
 def _value_text(value: JSON) -> str:
     if isinstance(value, float):
         return repr(value).removesuffix(".0")
+    if isinstance(value, str):
+        return value
     return json.dumps(value, default=str, ensure_ascii=False)
 
 

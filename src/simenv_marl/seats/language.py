@@ -5,7 +5,6 @@ import os
 from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
-from inspect import cleandoc
 from itertools import chain
 from time import perf_counter
 from typing import Any
@@ -178,8 +177,6 @@ class LanguageModelPolicy:
 
     def _system_text(self, decision: Decision, structured: bool) -> str:
         lines = [f"You decide for {decision.agent!r} in a running simulation."]
-        if decision.doc:
-            lines.append(f"What it decides: {cleandoc(decision.doc)}")
         form = 'of the form {"action": ...} with a legal action, and nothing else'
         if structured:
             schema = json.dumps(_answer_schema(decision), ensure_ascii=False)

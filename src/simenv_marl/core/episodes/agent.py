@@ -112,8 +112,7 @@ class Agent:
         plugins: The handlers that take part in its mappings.
         memory: Values of this agent in this episode: of differences, and of policies.
         reward: The reward of its previous action, as of its latest decision or its end.
-        raw_observation: The latest observation, where the user cannot have changed it. It is read
-            faster than ``observation``.
+        raw_observation: The latest observation, unless the user may have changed it.
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
         choices: The choices of the pending decision. None without ``choices=``.
@@ -375,6 +374,7 @@ class Agent:
         *,
         reward: bool = True,
         observe: bool = True,
+        asked: bool = True,
         last: bool = False,
     ) -> None:
         """Reward and observe the agent for the arguments of a call.
@@ -384,6 +384,7 @@ class Agent:
             kwargs: The keyword arguments.
             reward: Whether to reward the agent.
             observe: Whether to observe it.
+            asked: Whether it must decide now.
             last: Whether its episode ends here.
         """
         here = getcurrent() if DIFFERENCES else None  # differences must know the agent
@@ -401,7 +402,7 @@ class Agent:
                 informs = point.definition.rule_action_mapping is not None
                 self._is_quick = point.legal is None and not informs
             if observe:
-                self._observe(args, kwargs, last)
+                self._observe(args, kwargs, asked)
         finally:
             if here is not None:
                 # Without a function call, which fails at the recursion limit.
@@ -410,12 +411,12 @@ class Agent:
                 else:
                     EVALUATING[here] = before
 
-    def _observe(self, args: Args, kwargs: Kwargs, last: bool) -> None:
+    def _observe(self, args: Args, kwargs: Kwargs, asked: bool) -> None:
         """Set the mask, the info and the observation for the arguments of a call."""
         point = self.point
         self.present = True
         if point.legal is not None:
-            self._restrict(args, kwargs, last)
+            self._restrict(args, kwargs, asked)
         if self.clock is None:
             self.info = {}
         else:
@@ -431,13 +432,13 @@ class Agent:
         else:
             self.observation = point.cast(point.observation_mapping(*args, **kwargs))
 
-    def _restrict(self, args: Args, kwargs: Kwargs, last: bool) -> None:
-        """Set the mask and the choices. An agent that has ended will not be asked again."""
+    def _restrict(self, args: Args, kwargs: Kwargs, asked: bool = True) -> None:
+        """Set the mask and the choices. If it must not decide now, there may be no legal action."""
         legal: Any = self.point.legal
         try:
             self.mask, self.choices = legal(args, kwargs)
         except MaskError:
-            if not last:
+            if asked:
                 raise
             self.mask = self.point.open_mask()
             self.choices = None
@@ -445,7 +446,7 @@ class Agent:
     def observe_again(self, args: Args, kwargs: Kwargs) -> None:
         """Set the mask, the choices and the time at a decision in a round, and nothing else."""
         if self.point.legal is not None:
-            self._restrict(args, kwargs, last=False)
+            self._restrict(args, kwargs)
         if self.clock is not None:
             self.now = self.clock.read(None)["time"]
 
@@ -453,11 +454,10 @@ class Agent:
         """Forget the choices of an agent that was observed before its decision."""
         self.choices = None
 
-    def refresh(self, *, reward: bool = True, last: bool = False) -> None:
+    def refresh(self, *, reward: bool = True, asked: bool = False, last: bool = False) -> None:
         """Reward and observe the agent for the arguments of its latest decision, at any later time.
 
-        Where the model has freed an argument that a mapping takes, the reward is 0.0, and the last
-        observation stays.
+        If a mapping takes an argument that the model has freed, 0.0 and the last observation stay.
         """
         arguments = self.arguments
         if arguments.is_single and self._is_quick and reward and not DIFFERENCES:
@@ -485,7 +485,7 @@ class Agent:
         args, kwargs = arguments.recall()
         gone = freed(args, kwargs)
         if not gone:
-            self.update(args, kwargs, reward=reward, last=last)
+            self.update(args, kwargs, reward=reward, asked=asked, last=last)
             return
         point = self.point
         observes = not any(mapping.takes_any(gone) for mapping in point.takes_for_observation)
@@ -498,7 +498,8 @@ class Agent:
         elif not observes and self.decided:
             self.handler.warn_of_gone(gone, "the last observation stays")
         if pays or observes:
-            self.update(args, kwargs, reward=reward and pays, observe=observes, last=last)
+            pays = reward and pays
+            self.update(args, kwargs, reward=pays, observe=observes, asked=asked, last=last)
 
     def conclude(self) -> None:
         """End the agent's episode: give it its last reward and observation."""

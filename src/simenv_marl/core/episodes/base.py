@@ -14,12 +14,14 @@ from gymnasium.utils import seeding
 
 from ...errors import (
     AgentError,
+    ObservationError,
     OptionValueError,
     SimEnvError,
     ViewError,
     annotate,
     short_repr,
 )
+from ...hooks.hook import Hook
 from ...simulation import RULE, Action, Model, Observation
 from ..plans.plan import Plan
 from ..plans.point import Point, Policy, Space
@@ -30,6 +32,7 @@ from ..switching.driver import WAIT
 from ..switching.generators import is_seed
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
+from ..values.common import Encode, common_observations
 from ..values.spaces import observation_cast
 from ..values.stacking import stacked, stacker
 from .events import Handlers
@@ -258,11 +261,18 @@ class StateReader:
             ViewError: These observations cannot be flattened.
         """
         space = plan.options.state_space
-        self._roster: Mapping[str, Point] | None = None
+        self._places: Mapping[str, Sequence[Point]] | None = None
+        self._codes: dict[str, dict[Hook, Encode | None]] = {}  # by agent and point
         self._unanswered: tuple[Policy, ...] = ()  # policies of agents that the roster omits
         if isinstance(space, str):
-            self._roster = roster = plan.roster if plan.has_user else self._answered(plan)
-            parts = [point.definition.observation_space for point in roster.values()]
+            self._places = places = plan.places if plan.has_user else self._answered(plan)
+            parts = []
+            for name, points in places.items():
+                seen = [point.definition.observation_space for point in points]
+                part, encoders = common_observations(seen)
+                parts.append(part)
+                hooks = [point.hook for point in points]
+                self._codes[name] = dict(zip(hooks, encoders, strict=True))
             self._whole = spaces.Tuple(parts)
             space = spaces.flatten_space(self._whole)
             if not isinstance(space, spaces.Box):
@@ -279,18 +289,30 @@ class StateReader:
         Raises:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: There is no episode to observe.
+            ObservationError: The state is no array, or does not fit its space.
             AgentError: An agent that policies answer was not declared.
         """
-        if self._roster is None:
-            return self._cast(session.ask("state"))
+        if self._places is None:
+            state = session.ask("state")
+            try:
+                return self._cast(state)
+            except ValueError as error:
+                problem = str(error).replace("the observation", "the state")
+                raise ObservationError(
+                    f"state() has returned an illegal value: {problem}"
+                ) from None
         episode = session.episode
         if episode is None:
             raise session.refusal()
         found = {**episode.others, **episode.ended, **episode.agents}
         observations = []
-        for name, point in self._roster.items():
-            observation = found.pop(name).observation if name in found else None
-            observations.append(point.blank() if observation is None else observation)
+        for name, codes in self._codes.items():
+            agent = found.pop(name, None)
+            point = self._places[name][0] if agent is None else agent.point
+            observation = None if agent is None else agent.observation
+            seen = point.blank() if observation is None else observation
+            encode = codes.get(point.hook)
+            observations.append(seen if encode is None else encode(seen))
         for name, agent in found.items():
             if self._unanswered and agent.policy not in self._unanswered:
                 raise AgentError(
@@ -305,7 +327,7 @@ class StateReader:
             return stacked(states) if states else np.zeros(0)
         return stacker(self.space)(states)
 
-    def _answered(self, plan: Plan) -> Mapping[str, Point]:
+    def _answered(self, plan: Plan) -> Mapping[str, Sequence[Point]]:
         """Return the decision points of the agents that policies answer, by agent."""
         self._unanswered = None, RULE, plan.subject.default_policy
         points = list(plan.points)
@@ -317,9 +339,9 @@ class StateReader:
                 " possible_agents="
             )
         return {
-            name: point
-            for name, point in roster.items()
-            if plan.policy_of(name, point) not in self._unanswered
+            name: places
+            for name, places in roster.items()
+            if plan.policy_of(name, places[0]) not in self._unanswered
         }
 
 

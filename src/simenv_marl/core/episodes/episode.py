@@ -37,7 +37,7 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
+from ...simulation import EVERYONE, RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
     AskingPolicy,
@@ -488,7 +488,7 @@ class Episode(EpisodeState):
                 continue
             if not agent.arguments.is_empty:
                 self.latest = agent
-            agent.refresh(reward=in_rounds)
+            agent.refresh(reward=in_rounds, asked=agent is pending)
             if in_rounds and self.skips and agent.present:
                 agent.carry_reward(not self.turns)
             if agent.choices is not None and agent is not pending:
@@ -513,13 +513,16 @@ class Episode(EpisodeState):
             for call in expected_calls(point.hook.name):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
-                    agent = None if name is None else self.agent_for(handler, name)
-                    if agent is None or agent in known or agent.ended:
-                        continue
-                    known.add(agent)
-                    is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
-                    if everyone or is_asked:
-                        agent.keep(args, kwargs)
+                    agent = self.find(name) if isinstance(name, str) else None
+                    if agent is not None:
+                        is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
+                        if agent in known or agent.ended or not (everyone or is_asked):
+                            continue  # it stays at its point
+                    if name is not None:
+                        agent = self.agent_for(handler, name)
+                        known.add(agent)
+                        if everyone or not agent.delegated:
+                            agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on.
@@ -583,15 +586,15 @@ class Episode(EpisodeState):
 
     def delegate(self, policies: Mapping[str, Policy]) -> None:
         """In a branch, let policies answer for the agents that follow the rule."""
-        substitutes: dict[str, Policy] = {}
+        substitutes: dict[Any, Policy] = {}
         for name in policies.keys() - self.agents.keys():
             policy = policy_for(policies, name, self.where)
-            if policy is not RULE:
-                substitutes[name] = two_arguments(policy)
+            substitutes[name] = policy if policy is RULE else two_arguments(policy)
         self.plan = self.plan.with_policies(substitutes)
         for name, agent in self.others.items():
-            if name in substitutes and agent.policy is RULE:
-                agent.delegate(substitutes[name])
+            substitute = substitutes.get(name, substitutes.get(EVERYONE, RULE))
+            if agent.policy is RULE and substitute is not RULE:
+                agent.delegate(substitute)
 
     # -- ends -------------------------------------------------------------------------------------
 

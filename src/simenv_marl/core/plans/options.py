@@ -179,7 +179,8 @@ class Options:
         state_space: The space whose shape and dtype ``state()`` has. None: ``state()`` returns the
             value of the simulation's ``state()`` as it is. "observations": the state is the
             observations of all possible agents in one vector, and the simulation needs no
-            ``state()``.
+            ``state()``. Agents that ``policies`` answers are no possible agents; where whole
+            episodes run, only agents that policies answer are in the state.
         render_mode: The form of the result of ``render``: one of the simulation's ``render_modes``.
     """
 

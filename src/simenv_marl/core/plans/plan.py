@@ -6,7 +6,7 @@ options. It is a value: it has no state of any environment, so that one plan ser
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -212,6 +212,7 @@ class Plan:
             several.
         roster: The decision points of the agents that are known beforehand, by agent, in the order
             of the points.
+        places: All decision points of these agents, by agent.
         complete: Whether ``roster`` contains all possible agents.
         removers: The functions whose calls end agents.
         overrides: The functions that override each of the points, and are no points.
@@ -232,6 +233,7 @@ class Plan:
     named_agents: frozenset[str]
     one_agent: str | None
     roster: Mapping[str, Point]
+    places: Mapping[str, Sequence[Point]]
     complete: bool
     removers: tuple[Remover, ...]
     overrides: Mapping[Point, Collection[Hook]]
@@ -326,9 +328,10 @@ class Plan:
         subject = replace(self.subject, mode=Mode.SIMULATE)
         return replace(self, subject=subject, one_agent=agent, named_agents=frozenset())
 
-    def with_policies(self, policies: Mapping[str, Policy]) -> Plan:
+    def with_policies(self, policies: Mapping[Any, Policy]) -> Plan:
         """Return the plan of a branch in which policies answer for agents that have none."""
-        return replace(self, policies={**policies, **self.policies})
+        everyone = policies.get(EVERYONE, self.everyone)
+        return replace(self, policies={**policies, **self.policies}, everyone=everyone)
 
     def __deepcopy__(self, memory: object) -> Plan:
         return self  # because nothing changes it
@@ -469,9 +472,9 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         if is_active:
             active.append(point)
     declared = options.possible_agents if has_user else None
-    roster, complete = resolve_roster(active, declared, agents.values())
-    if has_user:
-        roster = {name: point for name, point in roster.items() if name not in by_agent}
+    places, complete = resolve_roster(active, declared, agents.values())
+    taken = by_agent if has_user else ()
+    roster = {name: place[0] for name, place in places.items() if name not in taken}
     if options.agent is not None and (active or None not in known):
         active, roster = _choose_one(options.agent, known, active, roster, complete, by_agent)
         complete = True
@@ -505,6 +508,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         named_agents=frozenset({*by_agent, *options.declared_agents} - ruled),
         one_agent=_one_agent(active, options),
         roster=roster,
+        places={name: places.get(name, [point]) for name, point in roster.items()},
         complete=complete,
         removers=removers,
         overrides=others,
@@ -563,8 +567,9 @@ def _choose_one(
     elif len(points) > 1:
         raise AgentError(
             f"the agent {short_repr(agent)} may decide at"
-            f" {', '.join(point.hook.name for point in points)}; name its decision point in"
-            " points=, or declare the agents of each with possible_agents="
+            f" {', '.join(point.hook.name for point in points)}; for a single view, name one of"
+            " these in points=, or declare the agents of each with possible_agents=; other views"
+            " take no agent="
         )
     return points, {agent: points[0]}
 

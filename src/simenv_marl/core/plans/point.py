@@ -237,9 +237,12 @@ class Point:
 
     def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
         """Make a function callable with all arguments of a call, as ``adapt`` does."""
+        signature = signature_of(function)
         if self.definition.split is not None and name not in _WITHOUT_ITEM:
-            leading += 1
-        if name == "rule_action_mapping" and signature_of(function) is None:  # such as int
+            kinds = {None} if signature is None else {p.kind for p in signature.parameters.values()}
+            if leading or kinds - {inspect.Parameter.KEYWORD_ONLY}:  # else it takes no argument
+                leading += 1
+        if name == "rule_action_mapping" and signature is None:  # such as int
             return Mapped(lambda decision, *args, **kwargs: function(decision), None)
         gives_answers = self.gives_answers and name not in _WITHOUT_ANSWERS
         return adapt(function, name, self.hook, leading, ("_answers",) * gives_answers)

@@ -225,8 +225,8 @@ def resolve_roster(
     active: list[Point],
     declared: Mapping[Any, Iterable[str]] | list[str] | None,
     known: Collection[str | None],
-) -> tuple[dict[str, Point], bool]:
-    """Find out which agents are known beforehand, and whether there can be no others."""
+) -> tuple[dict[str, list[Point]], bool]:
+    """Find out where known agents decide, by agent, and whether there can be no others."""
     naming = [point.hook for point in active if point.agent is None]
     names: dict[DecisionPoint, Iterable[str | None]] = {}
     if isinstance(declared, Mapping):
@@ -247,14 +247,14 @@ def resolve_roster(
                 f" point names its agents by a callable; here {len(naming)} do"
             )
         names = dict.fromkeys(naming, others)
-    roster: dict[str, Point] = {}
+    roster: dict[str, list[Point]] = {}
     for point in active:
         for name in names.get(point.hook, ()) if point.agent is None else [point.agent]:
-            if not isinstance(name, str) or roster.get(name) is point:
+            if not isinstance(name, str) or point in roster.get(name, ()):
                 raise AgentError(
                     f"possible_agents must be different strings, not {short_repr(name)}"
                 )
-            roster.setdefault(name, point)
+            roster.setdefault(name, []).append(point)
     return roster, not naming or declared is not None
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final, Protocol, TypeAlias, TypeVar
 from gymnasium.spaces import Tuple
 
 from ...errors import OptionValueError, short_repr
-from ...simulation import RULE, Action, Observation, asks_for, positional
+from ...simulation import EVERYONE, RULE, Action, Observation, asks_for, positional
 from ..switching.awaiting import wait_for
 from .point import Policy, Space
 
@@ -143,7 +143,7 @@ def policy_for(policy: Policy, agent: str, where: Where) -> Policy:
     """
     while policy is not RULE:
         if isinstance(policy, Mapping):
-            policy = policy.get(agent, RULE)
+            policy = policy.get(agent, policy.get(EVERYONE, RULE))
         elif where >= Where.BRANCH and is_planner(policy):
             policy = getattr(policy, "base", RULE)
         elif where >= Where.CLONE and (waits(policy) or records(policy)):

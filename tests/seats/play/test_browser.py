@@ -223,7 +223,7 @@ def test_two_people_and_a_policy_go_on_after_a_crash(open_page, start, tmp_path)
 
     server = start(*arguments, simulation=MARKET)
     wait_for_turn(second)
-    second.wait_for_function("!document.querySelector('main').inert")
+    second.wait_for_selector("body:not(.dead)")
     assert (rows(second), second.locator("#facts").inner_text()) == before
     choose(second, "6 crates")
     wait_for_turn(first)

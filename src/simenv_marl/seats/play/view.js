@@ -193,7 +193,8 @@ function drawFutures() {
     if (isRule && fan.rule_words) entry.name.textContent = `By the rule: ${fan.rule_words.replace(/^[^:]*: (?=[^,]*$)/, "")}`;
     if (!isRule && !state.pending.form.cards) entry.name.textContent = words.replace(/^[^:]*: (?=[^,]*$)/, "");
     if (allSame !== null || (isRule && twin)) { entry.chart.replaceChildren(); continue; }
-    const few = n > 1 ? ` (${show(band[0].at(-1))} to ${show(band[2].at(-1))})` : "";
+    const [low, high] = [show(band[0].at(-1)), show(band[2].at(-1))];
+    const few = n > 1 && low !== high ? ` (${low} to ${high})` : "";
     const less = isRule || rule === undefined || Math.abs(end - rule) <= close ? "" : `${signed(+(end - rule).toPrecision(3))} than the rule`;
     const more = less.startsWith("+") ? less.slice(1).replace("than", "more than") : less.slice(1).replace("than", "less than");
     const text = make("span", { className: "dim" }, make("b", {}, show(end)), few, less ? `, ${more}` : "");

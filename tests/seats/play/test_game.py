@@ -686,3 +686,14 @@ def test_masked_actions_are_hidden_and_values_have_four_digits():
     assert form == {"cards": [{"action": 0, "text": "no"}, {"action": 2, "text": "two"}]}
     texts = [shown(value) for value in (1 / 3, 1234.56, 123456.7, 1e-7, 12, True, np.float32(0.1))]
     assert texts == ["0.3333", "1235", "123457", "1e-07", "12", "yes", "0.1"]
+
+
+def test_a_game_that_is_over_is_resumed_at_its_end(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    over = play(make_host(record=path), [2] * 8)
+    moments = {"moment": 0, "event": ""}
+    again = make_host(seats=(), record=path)  # with the recorded seats
+    assert settle(again) | moments == over | moments
+    again.handle("buyer", {"do": "undo"})
+    assert settle(again)["turn"] == 14
+    assert settle(make_host(record=path))["turn"] == 14

@@ -49,6 +49,11 @@ Example = tuple[Callable[..., Any], dict[str, Definition], dict[str, Any]]
 """A model, its decision points, and the options of its environments."""
 
 
+def places(cells: Iterable[Any]) -> dict[int, str]:
+    """Return the labels of actions that lead to cells: their coordinates."""
+    return {action: str(cell.coordinate) for action, cell in enumerate(cells)}
+
+
 def boltzmann_wealth() -> Example:
     """A person decides where to go, and gives money away there."""
     move = make_step(
@@ -59,6 +64,13 @@ def boltzmann_wealth() -> Example:
         apply=lambda cell, person: setattr(person, "cell", cell),
         reward_mapping=difference(lambda person: person.wealth),
         agent=lambda person: f"person_{person.unique_id}",
+        question="Where do you go, to give money away there?",
+        display_mapping=lambda person: {
+            "your money": person.wealth,
+            "others here": len(person.cell.agents) - 1,
+        },
+        action_labels=lambda person: places(person.cell.neighborhood),
+        observation_labels=["your money", "others here"],
     )
     return (
         BoltzmannWealth,
@@ -85,6 +97,13 @@ def schelling() -> Example:
         apply=relocate,
         reward_mapping=lambda household: float(household.happy),
         agent=lambda household: f"household_{household.unique_id}",
+        question="Does the household move to another place?",
+        display_mapping=lambda household: {
+            "happy": "yes" if household.happy else "no",
+            "neighbours": sum(not cell.is_empty for cell in household.cell.neighborhood),
+        },
+        action_labels=["stay", "move"],
+        observation_labels=["happy", "neighbours of its kind", "neighbours"],
     )
     return Schelling, {"mesa.examples.basic.schelling.agents.SchellingAgent.step": step}, {}
 
@@ -104,6 +123,13 @@ def boid_flockers() -> Example:
         apply=turn,
         reward_mapping=lambda boid: len(boid.get_neighbors_in_radius(radius=boid.vision)[0]),
         agent=lambda boid: f"boid_{boid.unique_id}",
+        question="By how much does the bird turn?",
+        display_mapping=lambda boid: {
+            "position": f"{boid.position[0]:.1f}, {boid.position[1]:.1f}",
+            "direction": f"{boid.direction[0]:.2f}, {boid.direction[1]:.2f}",
+        },
+        action_labels=["radians"],
+        observation_labels=["position x", "position y", "direction x", "direction y"],
     )
     return BoidFlockers, {"mesa.examples.basic.boid_flockers.agents.Boid.step": step}, {}
 
@@ -120,6 +146,13 @@ def conways_game_of_life() -> Example:
         apply=lambda action, cell: setattr(cell, "_next_state", int(action)),
         reward_mapping=lambda cell: cell.state,
         agent=lambda cell: f"cell_{cell.unique_id}",
+        question="Does the cell live in the next step?",
+        display_mapping=lambda cell: {
+            "it lives now": "yes" if cell.is_alive else "no",
+            "living neighbours": sum(other.is_alive for other in cell.neighbors),
+        },
+        action_labels=["no", "yes"],
+        observation_labels=["it lives", "living neighbours"],
     )
     return (
         ConwaysGameOfLife,
@@ -142,6 +175,10 @@ def virus_on_network() -> Example:
         ),
         reward_mapping=lambda node: -float(node.state.value == 1),
         agent=lambda node: f"node_{node.unique_id}",
+        question="Is the computer treated?",
+        display_mapping=lambda node: {"state": node.state.name.lower()},
+        action_labels=["no", "yes"],
+        observation_labels={0: "susceptible", 1: "infected", 2: "resistant"},
     )
     points = {"mesa.examples.basic.virus_on_network.agents.VirusAgent.check_situation": check}
     return VirusOnNetwork, points, {"global_rng": True}
@@ -163,6 +200,13 @@ def epstein_civil_violence() -> Example:
         apply=lambda cell, cop: None if cell is cop.cell else cop.move_to(cell),
         reward_mapping=lambda cop: -float(cop.model.ACTIVE),
         agent=lambda cop: f"cop_{cop.unique_id}",
+        question="Where does the cop go?",
+        display_mapping=lambda cop: {
+            "persons in sight": sum(1 for _ in cop.neighbors),
+            "active citizens": cop.model.ACTIVE,
+        },
+        action_labels=lambda cop: places([cop.cell, *cop.empty_neighbors]),
+        observation_labels=["persons in sight", "free places in sight"],
     )
     return (
         EpsteinCivilViolence,
@@ -184,12 +228,24 @@ def pd_grid() -> Example:
         apply=lambda action, prisoner: setattr(prisoner, "next_move", "CD"[action]),
         reward_mapping=difference(lambda prisoner: prisoner.score),
         agent=lambda prisoner: f"prisoner_{prisoner.unique_id}",
+        question="Does the prisoner cooperate?",
+        display_mapping=lambda prisoner: {
+            "score": prisoner.score,
+            "cooperates now": "yes" if prisoner.is_cooroperating else "no",
+        },
+        action_labels=["cooperate", "defect"],
+        observation_labels=["score", "cooperates", "neighbours who cooperate"],
     )
     return PdGrid, {"mesa.examples.advanced.pd_grid.agents.PDAgent.step": cooperate}, {}
 
 
 def sugarscape() -> Example:
     """A trader decides where to go, until it starves."""
+
+    def reach(trader: Any) -> list[Any]:
+        around = trader.cell.get_neighborhood(trader.vision)
+        return [trader.cell, *(cell for cell in around if cell.is_empty)]
+
     move = make_step(
         observation_space=Box(-np.inf, np.inf, (4,), np.float32),
         observation_space_mapping=lambda trader: [
@@ -199,13 +255,19 @@ def sugarscape() -> Example:
             trader.cell.spice,
         ],
         action_space=Discrete(62),
-        choices=lambda trader: [
-            trader.cell,
-            *(cell for cell in trader.cell.get_neighborhood(trader.vision) if cell.is_empty),
-        ],
+        choices=reach,
+        action_labels=lambda trader: places(reach(trader)),
         apply=lambda cell, trader: setattr(trader, "cell", cell),
         reward_mapping=lambda trader: 1.0,
         agent=lambda trader: f"trader_{trader.unique_id}",
+        question="Where does the trader go?",
+        display_mapping=lambda trader: {
+            "sugar": trader.sugar,
+            "spice": trader.spice,
+            "sugar here": trader.cell.sugar,
+            "spice here": trader.cell.spice,
+        },
+        observation_labels=["sugar", "spice", "sugar here", "spice here"],
         removed_by="mesa.agent.Agent.remove",
     )
     return SugarscapeG1mt, {"mesa.examples.advanced.sugarscape_g1mt.agents.Trader.move": move}, {}
@@ -224,6 +286,13 @@ def wolf_sheep() -> Example:
             ),
             reward_mapping=lambda animal: 1.0,
             agent=lambda animal: f"{kind}_{animal.unique_id}",
+            question=f"Where does the {kind.lower()} go?",
+            display_mapping=lambda animal: {
+                "energy": animal.energy,
+                "animals and grass here": len(animal.cell.agents),
+            },
+            action_labels=lambda animal: places(animal.cell.neighborhood),
+            observation_labels=["energy", "animals and grass here"],
             removed_by="mesa.agent.Agent.remove",
         )
 
@@ -246,6 +315,14 @@ def alliance_formation() -> Example:
         apply=lambda action, model, pair: worth(model, pair) if action else None,
         reward_mapping=difference(lambda model, pair: max(agent.power for agent in model.agents)),
         agent="matchmaker_0",
+        question="Do these two join?",
+        display_mapping=lambda model, pair: {
+            f"{name} of the {place}": f"{getattr(one, name):.3f}"
+            for place, one in zip(("first", "second"), pair, strict=True)
+            for name in ("power", "position")
+        },
+        action_labels=["no", "yes"],
+        observation_labels=["power 1", "position 1", "power 2", "position 2"],
     )
     name = (
         "mesa.examples.advanced.alliance_formation.model."

@@ -24,7 +24,7 @@ COMMAND = [
 def decide(page: Any, value: str) -> None:
     """Enter an action."""
     page.locator("#decision:not([hidden]) #inputs input[type=number]").fill(value)
-    page.keyboard.press("Enter")
+    page.locator("#decide").click()
     page.wait_for_selector("#decision", state="hidden")
 
 
@@ -33,7 +33,9 @@ def main() -> None:
     from playwright.sync_api import sync_playwright
 
     server = subprocess.Popen(
-        [*COMMAND, "--port", "0", "--seed", "3"], stdout=subprocess.PIPE, text=True
+        [*COMMAND, "--port", "0", "--seed", "3", "--title", "A greenhouse"],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert server.stdout is not None
     lines = [server.stdout.readline() for _ in range(3)]
@@ -51,7 +53,7 @@ def main() -> None:
             decide(desktop, f"0.0{7 - day}")
         for page, name, value in ((phone, "play-phone", "0.4"), (desktop, "play-desktop", "0.06")):
             page.wait_for_selector("#decision:not([hidden])")
-            page.wait_for_timeout(4000)  # for all futures
+            page.locator("#legend", has_text="16 futures").wait_for(timeout=300_000)
             page.screenshot(path=FOLDER / f"{name}.png")
             decide(page, value)
         browser.close()

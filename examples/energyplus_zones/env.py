@@ -70,6 +70,17 @@ def to_action(degrees: float) -> list[float]:
     return [(degrees - LOWEST_SETPOINT) / (HIGHEST_SETPOINT - LOWEST_SETPOINT)]
 
 
+def display(zone: Zone) -> dict[str, str | int]:
+    """Return what people and language models read in place of the observation."""
+    return {
+        "hour of the day": f"{zone.building.hour:.2f}",
+        "outside": f"{zone.building.outside:.1f} °C",
+        "in the room": f"{zone.temperature:.1f} °C",
+        "in the room beside it": f"{zone.other.temperature:.1f} °C",
+        "people in the room": int(zone.people),
+    }
+
+
 POINT: Final = f"{Zone.__module__}.Zone.choose_setpoint"
 POINTS: Final[dict[Any, Definition]] = {
     POINT: make_step(
@@ -82,6 +93,10 @@ POINTS: Final[dict[Any, Definition]] = {
         action_space_mapping=to_degrees,
         reward_mapping=reward,
         agent=lambda zone: f"{zone.name}_0",
+        question="How warm shall the room be, from coolest (0) to warmest (1)?",
+        display_mapping=display,
+        action_labels=["from 0 to 1"],
+        observation_labels=OBSERVED,
     )
 }
 """The thermostats of both rooms."""

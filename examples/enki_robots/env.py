@@ -74,6 +74,28 @@ def observe(call: Any) -> NDArray[np.float32]:
     )
 
 
+OBSERVED: Final = (
+    *(f"sensor {number}, in thousands" for number in range(1, 5)),
+    "metres to the nearest robot",
+    "radians to the nearest robot",
+    "metres to the nearest dirt",
+    "radians to the nearest dirt",
+    "charge, full at 1",
+)
+"""The labels of the observation."""
+
+
+def display(call: Any) -> dict[str, str]:
+    """Return what people and language models read in place of the observation."""
+    (other, to_other), (dirt, to_dirt) = call.other, call.dirt
+    return {
+        "nearest dirt": f"{dirt / 100:.2f} m, at {np.degrees(to_dirt):.0f}°",
+        "nearest robot": f"{other / 100:.2f} m, at {np.degrees(to_other):.0f}°",
+        "sensors": ", ".join(f"{sensor:.0f}" for sensor in call.sensors),
+        "charge": f"{call.charge:.0f} s",
+    }
+
+
 POINTS: Final[dict[str, Definition]] = {
     "robot.turn": make_step(
         observation_space=Box(-np.inf, np.inf, (9,), np.float32),
@@ -83,6 +105,10 @@ POINTS: Final[dict[str, Definition]] = {
         rule_action_mapping=lambda turn: np.array([turn], np.float32),
         reward_mapping=difference(attrgetter("swept")),
         agent=attrgetter("entity"),
+        question="How does the robot turn?",
+        display_mapping=display,
+        action_labels=["from -1 to 1"],
+        observation_labels=OBSERVED,
     )
 }
 """The decision point of the model, with its definition."""

@@ -125,6 +125,31 @@ def observe_client(company: Company, client: Client) -> NDArray[np.float32]:
     return np.array([*look_at(company), *own], np.float32)
 
 
+def display(*call: Any) -> dict[str, str | float]:
+    """Return what people and language models read of the company in place of the observation."""
+    company = company_of(*call)
+    market = company.market
+    return {
+        "coverage": f"{100 * company.coverage():.1f} %",
+        "policy coverage": f"{100 * company.policy_coverage():.1f} %",
+        "yearly measurements in a row below the minimum": company.measured_short,
+        "share of equities": f"{100 * company.manager.equities:.0f} %",
+        "yield": f"{100 * market.bond_yield:.2f} %",
+        "inflation": f"{100 * market.inflation:.2f} %",
+        "purchasing power of a right": f"{100 * company.indexed / market.price_level:.1f} %",
+    }
+
+
+def display_client(company: Company, client: Client) -> dict[str, str | float]:
+    """Return what people and language models read of a client in place of the observation."""
+    own = {
+        "age": f"{client.age / 12:.1f} years",
+        "wage": f"{client.wage / 100:.0f}",
+        "cost of the standard accrual": f"{100 * company.cost_rate(client):.1f} % of the wage",
+    }
+    return own | display(company)
+
+
 # -- rewards --------------------------------------------------------------------------------------
 
 
@@ -229,6 +254,9 @@ PREMIUMS: Final[dict[Any, Definition]] = {
         rule_action_mapping=premium_asked,
         reward_mapping=premium_reward,
         agent=agent_of,
+        question="Which premium does the company ask, as a share of the cost rate?",
+        display_mapping=display_client,
+        action_labels=[f"{100 * level:g} %" for level in SURCHARGES],
         removed_by={
             f"{Client.__module__}.Client.{event}": agent_of for event in ("vanish", "retire")
         },
@@ -237,9 +265,12 @@ PREMIUMS: Final[dict[Any, Definition]] = {
 """The premiums: one agent per client."""
 
 
-def decision(agent: str, levels: Sequence[float], **mappings: Any) -> Definition:
+def decision(agent: str, levels: Sequence[float], question: str, **mappings: Any) -> Definition:
     """Define a decision of the team among levels."""
     return make_step(
+        question=question,
+        display_mapping=display,
+        action_labels=[f"{100 * level:g} %" for level in levels],
         observation_space=SPACE,
         observation_space_mapping=observe,
         action_space=Discrete(len(levels)),
@@ -253,22 +284,32 @@ TEAM: Final[dict[Any, Definition]] = {
     f"{Company.__module__}.Company.choose_indexation": decision(
         "indexer_0",
         INDEXATIONS,
+        "By how much of the highest lawful indexation do the rights grow?",
         apply=index,
         action_mask_mapping=lawful_indexations,
         rule_action_mapping=indexed,
     ),
     f"{Company.__module__}.Company.choose_cut": decision(
-        "planner_0", CUTS, apply=cut, rule_action_mapping=was_cut
+        "planner_0",
+        CUTS,
+        "By how much of the shortfall does the plan cut the rights?",
+        apply=cut,
+        rule_action_mapping=was_cut,
     ),
     f"{Manager.__module__}.Manager.choose_mix": decision(
         "manager_0",
         MIXES,
+        "Which share of the investments are equities?",
         action_space_mapping=dict(enumerate(MIXES)),
         action_mask_mapping=lawful_mixes,
         rule_action_mapping=mixed,
     ),
     f"{Regulator.__module__}.Regulator.choose_demand": decision(
-        "regulator_0", CUTS, apply=cut, rule_action_mapping=was_cut
+        "regulator_0",
+        CUTS,
+        "Which cut does the regulator demand, as a share of the shortfall?",
+        apply=cut,
+        rule_action_mapping=was_cut,
     ),
 }
 """Indexation in good years, cuts in a shortfall, the asset mix, and the regulator's demand."""

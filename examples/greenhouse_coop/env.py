@@ -112,6 +112,21 @@ def _unit(value: float) -> float:
     return 1.0 if value > 1.0 else value if value > 0.0 else 0.0
 
 
+def display(greenhouse: Greenhouse) -> dict[str, str]:
+    """Return what people and language models read in place of the observation."""
+    pots = [plant for plant in greenhouse.pots if plant.health > 0]
+    water = sum(plant.water for plant in pots) / max(1, len(pots))
+    health = sum(plant.health for plant in pots) / max(1, len(pots))
+    return {
+        "day": f"{greenhouse.day + 1} of {DAYS}",
+        "temperature": f"{greenhouse.temp} °C",
+        "humidity of the air": f"{100 * greenhouse.humidity:.0f} %",
+        "living plants": f"{len(pots)} of {len(greenhouse.pots)}",
+        "their health": f"{100 * health:.0f} %",
+        "water in a pot": f"{water:.2f} of {POT_CAPACITY:g} litres",
+    }
+
+
 @difference
 def water_since(greenhouse: Greenhouse) -> float:
     """Litres poured since the previous decision of the agent that gets the reward."""
@@ -166,7 +181,9 @@ WATERING: Final[dict[Any, Definition]] = {
         rule_action_mapping=from_litres,
         reward_mapping=reward,
         agent=WATERER,
-        action_labels=["share of 1000 litres of water"],
+        question="How much water do you pour today, as a share of 1000 litres?",
+        display_mapping=display,
+        action_labels=["share of 1000 litres"],
         observation_labels=OBSERVED,
     )
 }
@@ -181,7 +198,9 @@ VENTILATION: Final[dict[Any, Definition]] = {
         rule_action_mapping=usual_exchange,
         reward_mapping=reward,
         agent=VENTILATOR,
-        action_labels=["share of the air that is exchanged"],
+        question="How much of the air do you exchange for outside air today?",
+        display_mapping=display,
+        action_labels=["share of the air"],
         observation_labels=OBSERVED,
     )
 }

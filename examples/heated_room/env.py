@@ -86,6 +86,12 @@ class RoomSim(SimulationInterface):
                 rule_action_mapping=lambda inputs: {"power": np.array([inputs["power"]])},
                 reward_mapping=lambda room: -float(_cost_since(room)),
                 agent="heater_0",
+                action_labels={"power": "heating power, kW"},
+                question="With how much power do you heat in the next step?",
+                display_mapping=lambda room: {
+                    "hour of the day": f"{room.hour:.2f}",
+                    **{n: f"{room.read(n):.1f}" for n in OBSERVED},
+                },
             )
         }
 

@@ -69,6 +69,16 @@ def points() -> dict[str, Definition]:
             action_space_mapping=int,
             reward_mapping=difference(lambda c: c.earned),
             agent=lambda c: c.entity,
+            question="How many plots do you sow with wheat?",
+            display_mapping=lambda c: {
+                "your money": c.money,
+                "your plots": c.plots,
+                "price of wheat": c.wheat_price,
+                "wheat in the granary": c.granary,
+                "farms": c.farms,
+            },
+            action_labels=[f"{plots} plots" for plots in range(PLOTS + 1)],
+            observation_labels=["money", "plots", "price of wheat", "granary", "farms"],
         ),
         PRICE: make_step(
             observation_space=Box(-1e3, 1e4, (6,), np.float32),
@@ -77,6 +87,17 @@ def points() -> dict[str, Definition]:
             action_space_mapping=lambda action: float(np.asarray(action).item()),
             reward_mapping=difference(lambda c: c.earned),
             agent=lambda c: c.entity,
+            question="What does a loaf of bread cost?",
+            display_mapping=lambda c: {
+                "your money": c.money,
+                "your price": c.price,
+                "loaves baked": c.baked,
+                "loaves sold": c.sold,
+                "price of wheat": c.wheat_price,
+                "shops": c.shops,
+            },
+            action_labels=["price of a loaf"],
+            observation_labels=["money", "price", "baked", "sold", "price of wheat", "shops"],
         ),
     }
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from simenv_marl import SimulationInterface, aec_env, difference, make_step
 from simenv_marl.envs import SimulationAECEnv
 
-from .model import MOST, TRADERS, Market, Trader
+from .model import MOST, ROUNDS, TRADERS, Market, Trader
 
 AGENTS: Final = [f"trader_{number}" for number in range(TRADERS)]
 """The names of the agents."""
@@ -50,6 +50,19 @@ def look(trader: Trader) -> NDArray[np.float32]:
     return np.array(seen, np.float32)
 
 
+def display(trader: Trader) -> dict[str, float | str]:
+    """Return what people and language models read in place of the observation."""
+    market = trader.market
+    return {
+        "round": f"{market.round + 1} of {ROUNDS}",
+        "price in the round before": market.price,
+        "your profit in the round before": trader.gain,
+        "your crates in the round before": trader.crates,
+        "crates of the others: now, or before if they decide after you": trader.crates_of_others(),
+        "traders who decide before you in this round": market.decided,
+    }
+
+
 choose = make_step(
     observation_space=Box(-np.inf, np.inf, (len(OBSERVED),), np.float32),
     observation_space_mapping=look,
@@ -60,6 +73,8 @@ choose = make_step(
     agent=lambda trader: AGENTS[trader.number],
     action_labels=["no crate", "1 crate", *(f"{crates} crates" for crates in range(2, MOST + 1))],
     observation_labels=OBSERVED,
+    question="How many crates do you bring to the market?",
+    display_mapping=display,
 )
 
 

@@ -91,6 +91,16 @@ def observe(call: Any) -> NDArray[np.float32]:
     return np.array(values, np.float32)
 
 
+def display(call: Any) -> dict[str, str]:
+    """Return what people and language models read in place of the observation."""
+    return {
+        "rate": f"{call.rate / 1e6:.2f} Mbit/s",
+        "latest round trip": f"{1000 * call.rtt:.0f} ms",
+        "shortest round trip": f"{1000 * call.least_rtt:.0f} ms",
+        "lost": f"{100 * call.loss:.0f} %",
+    }
+
+
 def to_factor(action: Any) -> float:
     """Map an action to a factor of the rate."""
     return float(2.0 ** np.asarray(action, float).item())
@@ -114,6 +124,10 @@ POINTS: Final[dict[str, Definition]] = {
         action_space_mapping=to_factor,
         reward_mapping=reward,
         agent=attrgetter("entity"),
+        question="By which power of two does the sender change its rate?",
+        display_mapping=display,
+        action_labels=["power of two"],
+        observation_labels=OBSERVED,
     )
 }
 """The decision point of the model, with its definition."""

@@ -30,7 +30,7 @@ from simenv_marl import (
 )
 
 from .exact import Decision
-from .model import INTEREST, PLACES, Queue
+from .model import INTEREST, KINDS, PLACES, Queue
 
 HORIZON: Final = 150.0
 """The length of an episode: what comes later weighs exp(-15)."""
@@ -47,6 +47,26 @@ def observation(decision: Decision) -> NDArray[np.float32]:
 def look(queue: Queue, kind: int) -> NDArray[np.float32]:
     """Observe the decision that is pending."""
     return observation((kind, (queue.waiting(0), queue.waiting(1), queue.serving())))
+
+
+def question(queue: Queue, kind: int) -> str:
+    """Return what is asked about an arriving job."""
+    job = KINDS[kind]
+    return (
+        f"A job of kind {job.name} arrives: it pays {job.reward:g} when it is done, and takes"
+        f" {1 / job.services:g} on average. Does it come in?"
+    )
+
+
+def display(queue: Queue) -> dict[str, str | int]:
+    """Return what people and language models read in place of the observation."""
+    serving = queue.serving()
+    waiting = {f"waiting, kind {job.name}": queue.waiting(kind) for kind, job in enumerate(KINDS)}
+    return {
+        "in service": "nothing" if serving is None else f"kind {KINDS[serving].name}",
+        **waiting,
+        "free places": PLACES - sum(waiting.values()),
+    }
 
 
 _gained = difference(lambda queue, kind: queue.present_value())
@@ -67,6 +87,14 @@ admission = make_step(
     reward_mapping=earn,
     rule_action_mapping=int,
     agent=AGENT,
+    question=question,
+    display_mapping=display,
+    action_labels=["turn it away", "let it in"],
+    observation_labels=[
+        *(f"the job is of kind {job.name}" for job in KINDS),
+        *(f"kind {job.name} is in service" for job in KINDS),
+        *(f"waiting, kind {job.name}" for job in KINDS),
+    ],
 )
 
 

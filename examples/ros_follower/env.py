@@ -49,6 +49,11 @@ POINTS: Final[dict[str, Definition]] = {
         action_labels=["metres per second forward", "radians per second to the left"],
         reward_mapping=lambda call: -abs(math.hypot(call.ahead, call.left) - 1.0),
         agent="follower_0",
+        question="How fast does the robot drive and turn?",
+        display_mapping=lambda call: {
+            "leader ahead": f"{call.ahead:.2f} m",
+            "leader to the left": f"{call.left:.2f} m",
+        },
     )
 }
 """The decision point of the controller, with its definition."""

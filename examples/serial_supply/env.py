@@ -164,6 +164,27 @@ def look(policy: Policy, *, _simulation: SerialSupply) -> NDArray[np.float32]:
     return seen.clip(-FARTHEST, FARTHEST)
 
 
+OBSERVED: Final = (
+    "echelon position, less the demand of its lead time",
+    "local position, less the demand of its lead time",
+    "stock, less what is owed",
+    "on the way, less the demand of its lead time",
+    "demand, less its mean",
+)
+"""The labels of the observation, which counts in periods of mean demand."""
+
+
+def display(policy: Policy, *, _simulation: SerialSupply) -> dict[str, float]:
+    """Return what people and language models read in place of the observation."""
+    state = policy.node.state_vars_current
+    return {
+        "your stock, less what you owe": float(state.get_inventory_level()),
+        "on its way to you": float(state.in_transit_from()),
+        "ordered in all": float(state.get_on_order_by_predecessor()),
+        "demand of the customers": _simulation.demand,
+    }
+
+
 _own = difference(lambda policy, _simulation: -_simulation.cost_of(policy.node.index - 1) / UNIT)
 
 
@@ -186,6 +207,10 @@ order = make_step(
     apply=place,
     reward_mapping=own_costs,
     rule_action_mapping=lambda quantity: [min(quantity, MOST)],
+    question="How much do you order from the stage before you?",
+    display_mapping=display,
+    action_labels=["quantity"],
+    observation_labels=OBSERVED,
 )
 """A stage's order, up to twice the mean demand."""
 
@@ -194,6 +219,7 @@ few_orders = replace(
     action_space=Discrete(len(QUANTITIES)),
     apply=lambda action, policy, position: place(QUANTITIES[action], policy, position),
     rule_action_mapping=lambda quantity: min(round(2 * quantity), len(QUANTITIES) - 1),
+    action_labels=[f"{quantity:g}" for quantity in QUANTITIES],
 )
 """The same in steps of half a unit, for learners of discrete actions."""
 

@@ -50,6 +50,9 @@ SIGHT: Final = 2
 DIRECTIONS: Final = ((-1, 0), (0, 1), (1, 0), (0, -1))
 """The step of each action."""
 
+STEPS: Final = ("up", "right", "down", "left")
+"""The labels of the actions."""
+
 MOVE: Final = "mesa.examples.advanced.wolf_sheep.agents.Sheep.move"
 """The decision point."""
 
@@ -110,6 +113,22 @@ def go(action: Any, sheep: Any) -> None:
     sheep.cell = sheep.cell.connections[DIRECTIONS[action]]
 
 
+def display(sheep: Any) -> dict[str, str | float]:
+    """Return what people and language models read in place of the observation."""
+    shown: dict[str, str | float] = {"your energy": float(sheep.energy)}
+    around = {"here": sheep.cell}
+    around |= {
+        label: sheep.cell.connections[direction]
+        for label, direction in zip(STEPS, DIRECTIONS, strict=True)
+    }
+    for label, cell in around.items():
+        wolves = sum(isinstance(other, Wolf) for other in cell.agents)
+        others = sum(isinstance(other, Sheep) and other is not sheep for other in cell.agents)
+        grass = any(isinstance(other, GrassPatch) and other.fully_grown for other in cell.agents)
+        shown[label] = f"{'grass' if grass else 'no grass'}, {wolves} wolves, {others} sheep"
+    return shown
+
+
 def turn(sheep: Any) -> float:
     """Reward each turn of a life."""
     return 1.0
@@ -129,7 +148,9 @@ def sheep_moves(sight: int = SIGHT) -> Definition:
         apply=go,
         reward_mapping=turn,
         agent=name,
-        action_labels=["row - 1", "column + 1", "row + 1", "column - 1"],
+        question="Where does the sheep go? Wolves move after it, one step.",
+        display_mapping=display,
+        action_labels=STEPS,
         observation_labels=[
             "energy",
             *(

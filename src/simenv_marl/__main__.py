@@ -76,16 +76,34 @@ def _inspect(simulation: str, points: list[str] | None, seed: int) -> Inspection
         raise OptionValueError(f"{simulation} cannot be run: {describe_error(error)}") from error
 
 
-def _play(simulation: str, seat: list[str], **options: Any) -> str:
-    from .many.parallel import import_extra
-
-    for package in ("starlette", "uvicorn", "websockets"):
-        import_extra(package, "play")
-    from .seats.play.server import play
+def _play(
+    simulation: str,
+    seat: list[str],
+    policy: list[str],
+    max_steps: int | None,
+    skip_forced: bool,
+    **options: Any,
+) -> str:
+    from .seats.play.host import Rules
+    from .seats.play.start import find_game, start
 
     # Not as a function of "__main__", because another process cannot import that.
     find = importlib.import_module(f"{__package__}.__main__").find_simulation
-    return play(partial(find, simulation), name=simulation, seats=seat, **options)
+    given = {"max_steps": max_steps, "skip_forced": skip_forced}
+    title = options.pop("title") or simulation.rpartition(":")[2]
+    make = partial(
+        find_game,
+        find,
+        simulation,
+        policy,
+        name=simulation,
+        seats=seat,
+        options={name: value for name, value in given.items() if value},
+        rules=Rules(title, *(options.pop(name) for name in ("tools", "limit", "time_unit"))),
+        **{name: options.pop(name) for name in ("seed", "new")},
+        record=options["record"],
+    )
+    return start(make, **options)
 
 
 def _wire_check(program: list[str], **limits: Any) -> WireReport:
@@ -257,7 +275,36 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., object], str, _Arguments]]] = {
             "--record": {
                 "type": Path,
                 "metavar": "FILE",
-                "help": "append the decisions to a file of JSON lines",
+                "help": "append the decisions to a file of JSON lines; go on with its game if it"
+                " exists",
+            },
+            "--new": {"action": "store_true", "help": "begin another game in an existing FILE"},
+            "--policy": {
+                "action": "extend",
+                "nargs": "+",
+                "default": [],
+                "metavar": "AGENT=module:object",
+                "help": "policies for agents; without AGENT=, a dict of policies",
+            },
+            "--max-steps": {
+                "type": int,
+                "metavar": "N",
+                "help": "the number of decisions after which time is up (default: none)",
+            },
+            "--skip-forced": {
+                "action": "store_true",
+                "help": "do not ask where one action alone is legal",
+            },
+            "--title": {"default": "", "help": "the title of the page (default: the class)"},
+            "--time-unit": {
+                "default": "",
+                "metavar": "UNIT",
+                "help": "the unit of the simulation's time, in the singular, such as hour",
+            },
+            "--tools": {
+                "choices": ("all", "facilitator", "none"),
+                "default": "all",
+                "help": "who may undo, jump, restart and let the rule play on (default: all)",
             },
         },
     ),

@@ -1,10 +1,14 @@
-"""Two people play the greenhouse in their browsers, by keyboard, to the end of an episode."""
+"""People play in their browsers: what they see, what decides, and what is told."""
 
 import json
+import os
+import signal
+import socket
 from pathlib import Path
 
 import pytest
 from examples.greenhouse_coop.env import GreenhouseSim
+from examples.market_seats.env import Free
 
 from simenv_marl.seats.play import replay
 from tests.seats.play.test_server import Server
@@ -14,6 +18,12 @@ playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs {CHROMIUM}")
 
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+GREENHOUSE = "examples.greenhouse_coop.env:GreenhouseSim"
+MARKET = "examples.market_seats.env:Free"
+QUEUE = "examples.queue_admission.env:QueueSimulation"
+PHONE = {"viewport": {"width": 390, "height": 844}}
+DESKTOP = {"viewport": {"width": 1280, "height": 800}}
+REFUSED = "ERR_CONNECTION_REFUSED"
 
 
 @pytest.fixture
@@ -42,22 +52,28 @@ def start():
 def open_page(browser):
     problems = []
 
-    def make(server, seat, **context):
+    def note(message):
+        if message.type == "error" and REFUSED not in message.text:  # while there is no server
+            problems.append(message.text)
+
+    def make(server, seat, path="", **context):
         page = browser.new_context(**context).new_page()
         page.set_default_timeout(60_000)
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on(
-            "console",
-            lambda message: problems.append(message.text) if message.type == "error" else None,
-        )
-        page.goto(f"{server.base}seat/{seat}?key={server.keys(seat)[0]}" if seat else server.base)
+        page.on("console", note)
+        key = f"seat/{seat}?key={server.keys(seat)[0]}" if seat else path
+        page.goto(f"{server.base}{key}")
         return page
 
     yield make
     assert problems == []
 
 
-def decide(page, value):
+def wait_for_turn(page):
+    page.wait_for_selector("#decision:not([hidden]) #decide")
+
+
+def enter(page, value):
     """Enter a value, with the keyboard alone."""
     page.wait_for_selector("#decision:not([hidden]) input:focus")
     page.keyboard.press("Control+a")
@@ -66,101 +82,246 @@ def decide(page, value):
     page.wait_for_selector("#decision", state="hidden")
 
 
-def wait_for_turn(page, turn):
-    page.locator("#facts", has_text=f"Decision {turn},").wait_for()
+def choose(page, text):
+    page.locator(".card", has_text=text).first.click()
+    page.locator("#decide").click()
 
 
-def test_two_people_play_the_greenhouse_to_its_end(open_page, start, tmp_path):
+def rows(page):
+    return page.locator("#rows tr").all_inner_texts()
+
+
+def fits(page):
+    """Whether the question, the situation, the answers and the button are on the screen."""
+    boxes = [
+        page.locator(place).bounding_box()
+        for place in ("#title", "#question", "#situation", "#inputs", "#answers", "#decide")
+    ]
+    height = page.viewport_size["height"]
+    wide = page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    return wide and all(box is None or box["y"] + box["height"] <= height for box in boxes)
+
+
+@pytest.mark.parametrize("model", [GREENHOUSE, QUEUE])
+def test_a_decision_is_on_one_screen_of_a_phone(open_page, start, model):
+    server = start("--seed", "3", "--title", "A day in the greenhouse", simulation=model)
+    seat = "ventilator_0" if model == GREENHOUSE else "admission_0"
+    page = open_page(server, seat, **PHONE)
+    wait_for_turn(page)
+    page.wait_for_selector(".card svg polyline")
+    assert fits(page)
+    assert page.locator("#title").inner_text() == "A day in the greenhouse"
+    assert page.locator("#undo").is_hidden()
+    assert server.end()[0] == 0
+
+
+def test_two_people_play_the_greenhouse(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
-    server = start(
-        "--seed",
-        "3",
-        "--record",
-        str(path),
-        simulation="examples.greenhouse_coop.env:GreenhouseSim",
-    )
-    airing = open_page(
-        server, "ventilator_0", viewport={"width": 390, "height": 844}, color_scheme="dark"
-    )
-    watering = open_page(server, "waterer_0", viewport={"width": 1280, "height": 800})
+    server = start("--seed", "3", "--record", str(path), simulation=GREENHOUSE)
+    airing = open_page(server, "ventilator_0", color_scheme="dark", **PHONE)
+    airing.wait_for_selector("#decision:not([hidden])")
+    watering = open_page(server, "waterer_0", **DESKTOP)
     watering.locator("#status", has_text="Waiting for ventilator_0").wait_for()
+    assert "22 °C" in airing.locator("#situation").inner_text().replace("21 °C", "22 °C")
 
     # Futures of each candidate, and of the action that the person has entered; the rule's action.
-    airing.wait_for_selector("#actions svg polygon")
-    airing.get_by_text("The rule: 0.2").wait_for()
-    airing.locator("#inputs input[type=number]").fill("0.31")
+    airing.locator(".card", has_text="By the rule: 0.2").wait_for()
+    airing.locator("#legend", has_text="Your points after 8 decisions").wait_for()
+    number = airing.locator("#inputs input[type=number]")
+    assert number.input_value() == "0.2"
+    number.fill("0.31")
     airing.get_by_text("What then?").click()
-    airing.locator("#actions button", has_text="0.31").locator("svg").wait_for()
-    airing.locator("#inputs input[type=number]").fill("7")
+    airing.locator(".card", has_text="0.31").locator("svg").wait_for()
+    number.fill("7")
     airing.keyboard.press("Enter")
-    airing.locator("#problem", has_text="7").wait_for()
+    airing.locator(".field .wrong", has_text="Enter a number from 0 to 1").wait_for()
+    assert airing.locator("#decision").is_visible()
 
-    for _ in range(3):
-        decide(airing, "0.3")
-        decide(watering, "0.05")
-    decide(airing, "0.4")
-    watering.wait_for_selector("#decision:not([hidden])")
-    shown = watering.locator("#facts, #charts b").all_inner_texts()
+    enter(airing, "0.3")
+    enter(watering, "0.05")
+    wait_for_turn(airing)
+    assert number.input_value() == "0.3"  # the last value of the person
+    airing.keyboard.press("Enter")  # decides nothing, because nothing was touched
+    airing.locator("#problem", has_text="first").wait_for()
+    enter(airing, "0.3")
+    enter(watering, "0.05")
+    enter(airing, "0.4")
+    wait_for_turn(watering)
+    assert rows(watering)[0].split("\t")[1:3] == ["ventilator_0", "share of the air: 0.4"]
+    shown = watering.locator("#facts, #situation b").all_inner_texts()
     watering.reload()
-    watering.wait_for_selector("#decision:not([hidden])")
-    assert watering.locator("#facts, #charts b").all_inner_texts() == shown
-    assert len(watering.locator("#charts polyline").all()) == 6
+    wait_for_turn(watering)
+    assert watering.locator("#facts, #situation b").all_inner_texts() == shown
+    assert watering.locator("#situation polyline").count() > 3
 
+    watering.locator("#tools summary").click()
     watering.locator("#undo").click()
-    watering.locator("#turn", has_text="5 of 7").wait_for()
+    airing.locator("#event", has_text="waterer_0 went back to decision 4").wait_for()
+    wait_for_turn(watering)
     watering.locator("#inputs input[type=number]").focus()
-    decide(watering, "0.06")  # which forgets what came after it
-    decide(airing, "0.5")
-    watering.wait_for_selector("#decision:not([hidden])")
+    enter(watering, "0.06")  # which forgets what came after it
+    enter(airing, "0.5")
+    wait_for_turn(watering)
+    airing.locator("#tools summary").click()
     for page in (airing, watering):
         page.locator("#many").fill("200")
         page.locator("#delegate").click()
     for page in (airing, watering):
-        page.locator("#status", has_text="The episode is over").wait_for()
+        page.locator("#ending", has_text="come to its end").wait_for()
+        page.locator("#compared", has_text="if the rule had decided").wait_for()
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    history = airing.evaluate("state.history")
+    total = float(airing.locator("#totals tr", has_text="ventilator_0").locator("b").inner_text())
     code, _, err = server.end()
     assert (code, err) == (0, "")
 
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line["action"] for line in lines if line.get("turn") == 5] == [[0.05], [0.06]]
+    assert [line["action"] for line in lines if line.get("agent") and line["turn"] == 3] == [
+        [0.05],
+        [0.06],
+    ]
     found = replay(path, GreenhouseSim)
-    for agent, trajectories in found.items():
-        assert trajectories.rewards.tolist() == [
-            row["reward"] for row in history if row["agent"] == agent
-        ]
-    assert found["waterer_0"].actions[:3, 0].tolist() == pytest.approx([0.05, 0.05, 0.06])
-    assert not found["waterer_0"].by_rule[:3].any()
-    assert found["waterer_0"].by_rule[3:].all()
+    assert found["ventilator_0"].returns[0] == pytest.approx(total, abs=0.01)
+    assert found["waterer_0"].actions[:2, 0].tolist() == pytest.approx([0.05, 0.06])
+    assert not found["waterer_0"].by_rule[:2].any()
+    assert found["waterer_0"].by_rule[2:].all()
 
 
-def test_buttons_and_grids_are_played_by_keys_and_texts_of_the_game_are_no_markup(open_page, start):
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+def test_two_people_and_a_policy_go_on_after_a_crash(open_page, start, tmp_path):
+    path, port = tmp_path / "game.jsonl", str(free_port())
+    arguments = [
+        "--seat", "trader_0", "trader_1", "--policy", "trader_2=tests.seats.play.worlds:five",
+        "--port", port, "--record", str(path), "--time-unit", "round",
+    ]  # fmt: skip
+    server = start("--seed", "3", *arguments, simulation=MARKET)
+    lobby = open_page(server, "", **PHONE)
+    lobby.locator("li", has_text="the policy five").wait_for()
+    lobby.locator("li", has_text="trader_0").get_by_text("Take").click()
+    first = lobby
+    wait_for_turn(first)
+    second = open_page(server, "trader_1", **DESKTOP)
+    choose(first, "3 crates")
+    for number in (2, 5):  # each round, another one is first
+        second.locator("#facts", has_text=f"Decision {number}.").wait_for()
+        choose(second, "2 crates")
+    wait_for_turn(first)
+    choose(first, "4 crates")
+    first.locator("#facts", has_text="Decision 11.").wait_for()
+    choose(first, "4 crates")
+    second.locator("#facts", has_text="Decision 12.").wait_for()
+    wait_for_turn(second)
+    before = rows(second), second.locator("#facts").inner_text()
+    assert any("trader_2\t5 crates\tpolicy" in row for row in before[0])
+    os.killpg(server.process.pid, signal.SIGKILL)
+    server.process.communicate()
+    first.locator("#status", has_text="The connection is lost").wait_for()
+    assert second.evaluate("document.querySelector('main').inert")
+
+    server = start(*arguments, simulation=MARKET)
+    wait_for_turn(second)
+    second.wait_for_selector("body:not(.dead)")
+    assert (rows(second), second.locator("#facts").inner_text()) == before
+    choose(second, "6 crates")
+    wait_for_turn(first)
+    first.locator("#tools summary").click()
+    first.locator("#restart").click()
+    first.locator("#yes").click()
+    second.locator("#event", has_text="trader_0 began another game").wait_for()
+    wait_for_turn(first)
+    first.locator("#redo").click()
+    second.locator("#event", has_text="went back to the game before").wait_for()
+    second.locator("#tools summary").click()
+    for page in (first, second):
+        page.locator("#many").fill("100")
+        page.locator("#delegate").click()
+    second.locator("#ending").wait_for()
+    assert server.end()[0] == 0
+    found = replay(path, Free)
+    assert found["trader_1"].actions[:3].tolist() == [2, 2, 6]
+    assert set(found["trader_2"].actions.tolist()) == {5}
+
+
+def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, start):
     server = start("--seed", "3", "--limit", "300")
     buyer, seller = open_page(server, "buyer"), open_page(server, "seller")
-    assert buyer.locator("#actions button").first.inner_text().startswith("1")
-    buyer.keyboard.press("3")  # the third: two pieces
-    seller.wait_for_selector("#decision:not([hidden])")
+    wait_for_turn(buyer)
+    assert buyer.locator(".card kbd").all_inner_texts() == ["0", "1", "2", "3", "b"]
+    assert buyer.locator("#decide").is_disabled()
+    buyer.keyboard.press("2")
+    assert buyer.locator(".card[aria-checked=true]").count() == 1
+    buyer.keyboard.press("Enter")
+    wait_for_turn(seller)
+    seller.keyboard.press("Enter")
+    seller.locator("#problem", has_text="first").wait_for()
     seller.locator("fieldset").nth(1).locator("label", has_text="2").click()
-    seller.get_by_text("Decide Enter").click()
-    wait_for_turn(buyer, 2)
-    assert buyer.evaluate("state.history.slice(0, 2).map((row) => row.action)") == [2, [0, 2]]
+    seller.locator("#decide").click()
+    seller.locator(".field .wrong", has_text="Choose one of these").first.wait_for()
+    seller.locator("fieldset").nth(0).locator("label", has_text="0").click()
+    seller.locator("#decide").click()
+    wait_for_turn(buyer)
+    assert [row.split("\t")[2] for row in rows(buyer)] == ["Part 1: 0, Part 2: 2", "2"]
+    assert buyer.locator("#clock").inner_text().endswith(" s")
     buyer.wait_for_selector("#image")
-    assert "s left" in buyer.locator("#facts").inner_text()
-    buyer.evaluate("problem('<img src=x onerror=alert(1)>')")
+    buyer.evaluate("document.getElementById('problem').textContent = '<img src=x>'")
     assert buyer.locator("#problem img").count() == 0
-    buyer.keyboard.press("u")
-    wait_for_turn(buyer, 0)
-    buyer.keyboard.press("y")
-    wait_for_turn(buyer, 2)
-    buyer.keyboard.press("r")
-    wait_for_turn(seller, 3)
-    assert seller.evaluate("state.history[2].by") == "rule"
-    spectator = open_page(server, "")
-    # and sees the futures, and has no controls
-    spectator.get_by_text("Decide for seller").wait_for()
-    spectator.wait_for_selector("#actions polygon")
-    spectator.keyboard.press("r")
-    assert spectator.evaluate(
-        "document.querySelector('#decision').inert && document.querySelector('#controls').hidden"
+    spectator = open_page(server, "", "watch")
+    spectator.locator("#question").wait_for()
+    spectator.wait_for_selector(".card polygon")
+    assert spectator.locator("button:enabled:visible").count() == 0
+    spectator.keyboard.press("2")
+    spectator.keyboard.press("Enter")
+    assert buyer.locator("#decision").is_visible()
+    second = open_page(server, "buyer")
+    second.locator("#event", has_text="open in 2 pages").wait_for()
+    assert server.end()[0] == 0
+
+
+def test_a_slow_model_is_told_at_once_and_no_click_counts_twice(open_page, start, tmp_path):
+    path = tmp_path / "game.jsonl"
+    server = start("--record", str(path), simulation="tests.seats.play.worlds:SlowShop")
+    page = open_page(server, "buyer")
+    wait_for_turn(page)
+    page.locator("#legend", has_text="computed").wait_for()  # futures take long, too
+    page.locator(".card").nth(1).click()
+    page.evaluate(
+        "document.getElementById('decide').dispatchEvent(new MouseEvent('click', {detail: 1}))"
     )
+    page.locator("#status", has_text="The simulation computes").wait_for(timeout=200)
+    page.evaluate(
+        "document.getElementById('decide').dispatchEvent(new MouseEvent('click', {detail: 1}))"
+    )
+    page.locator("#facts", has_text="Decision 2.").wait_for(timeout=10_000)
+    assert path.read_text().count('"agent"') == 1
+    assert server.end()[0] == 0
+
+
+def test_the_last_seconds_are_seen_and_a_wrong_key_sees_only_a_message(open_page, start):
+    server = start("--limit", "11", "--tools", "facilitator", "--seat", "buyer")
+    page = open_page(server, "buyer", **PHONE)
+    page.wait_for_selector("#clock.late")
+    assert page.locator("#tools").is_hidden()
+    facilitator = open_page(server, "", server.facilitator, **DESKTOP)
+    page.locator("#rows", has_text="as time was up").wait_for()
+    facilitator.locator("#tools summary").click()
+    facilitator.locator("#undo").click()
+    page.locator("#event", has_text="The facilitator went back").wait_for()
+    stranger = open_page(server, "", "seat/buyer?key=0")
+    stranger.locator("#status", has_text="ask for the link").wait_for()
+    assert stranger.locator("main").is_hidden()
+    assert server.end()[0] == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_seats_with_any_name_are_played(open_page, start, scheme):
+    server = start("--seed", "1", simulation="tests.seats.play.worlds:OddShop")
+    lobby = open_page(server, "", color_scheme=scheme)
+    lobby.get_by_text("Take").first.click()
+    wait_for_turn(lobby)
+    assert lobby.locator("#seat").inner_text() == "../a b/ü?&<i>"
+    choose(lobby, "1")
+    lobby.locator("#facts", has_text="Decision 2.").wait_for()
     assert server.end()[0] == 0

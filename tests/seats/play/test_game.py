@@ -1,7 +1,9 @@
 """The game of the page: decisions, the way back, futures, limits, and recordings."""
 
 import json
+import random
 import struct
+import time
 import zlib
 from base64 import b64decode
 from dataclasses import replace
@@ -10,67 +12,91 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+import simenv_marl
 from simenv_marl import RULE, aec_env, simulate
+from simenv_marl.data import joint_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
-from simenv_marl.seats.play.forms import action_of, jsonable
+from simenv_marl.seats.play.forms import (
+    action_of,
+    complaint_about,
+    form_of,
+    jsonable,
+    shown,
+    words_of,
+)
 from simenv_marl.seats.play.game import Game
+from simenv_marl.seats.play.host import Host, Rules
+from simenv_marl.seats.play.recording import read
 from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
 from tests.worlds import models
 
 
-@pytest.fixture
-def make_game():
-    games = []
+@pytest.fixture(autouse=True)
+def few_futures(monkeypatch):
+    monkeypatch.setattr("simenv_marl.seats.play.futures.FUTURES", 4)
 
-    def make(simulation=Shop, *, seats=("buyer",), seed=5, limit=None, record=None):
-        game = Game(simulation, name="shop", seats=seats, seed=seed, limit=limit, record=record)
-        games.append(game)
-        return game
+
+@pytest.fixture
+def make_host():
+    hosts = []
+
+    def make(
+        simulation=Shop, *, seats=("buyer",), seed=5, limit=None, tools="all", unit="", **options
+    ):
+        sent = []
+        game = Game(simulation, name="shop", seats=seats, seed=seed, **options)
+        hosts.append(Host(game, Rules("Shop", tools, limit, unit), sent.append))
+        hosts[-1].sent = sent
+        return hosts[-1]
 
     yield make
-    for game in games:
-        game.forget(-1)
-        game.env.close()
-        game.root.close()
+    for host in hosts:
+        host.abandon()
+        host.game.close()
 
 
-def settle(game):
+def settle(host):
     """Let the rule decide where no person does; return what the page gets then."""
     states = []
-    for update in game.work():
-        states += [update] if update else []
-        if game.now is not None and update and update["type"] == "state" and game.futures:
-            break
+    for update in host.work():
+        states += [update] if update and update["type"] == "state" else []
+        if update and update["type"] == "fan":
+            break  # else futures follow
     return states[-1]
 
 
-def think(game):
+def think(host):
     """Return the last message about the futures."""
-    return [update for update in game.work() if update][-1]
+    updates = [update for update in host.work() if update]
+    if host.game.can_fork:
+        host.exploring.wait()
+        updates += [message for _, message in host.sent]
+    return updates[-1]
 
 
-def play(game, actions):
+def play(host, actions):
     for action in actions:
-        settle(game)
-        game.decide(action, "person")
-    return settle(game)
+        settle(host)
+        host.handle(host.game.now["agent"], act(host, action))
+    return settle(host)
+
+
+def act(host, action):
+    return {"do": "act", "turn": host.game.turn, "action": action}
 
 
 class Connection:
     """Messages to come, then the end."""
 
     def __init__(self, *messages):
-        self.messages, self.sent = [*messages, (None, None, None)], []
+        self.messages = [*messages, (None, None, None)]
 
     def poll(self, timeout=0):
         return bool(self.messages)
 
     def recv(self):
         return self.messages.pop(0)
-
-    def send(self, message):
-        self.sent.append(message)
 
 
 def as_by_hand(actions):
@@ -79,84 +105,92 @@ def as_by_hand(actions):
     return models.play(env, {"buyer": iter(actions), "seller": RULE}, seed=5), env.simulation.profit
 
 
-def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_game):
+def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_host):
     """The rule decides for agents without a person."""
     actions = [3, 1, 0, 2, 1, 1, 0, 2]
-    game = make_game()
-    state = settle(game)
-    assert (state["turn"], state["pending"]["agent"], state["pending"]["doc"]) == (
+    host = make_host()
+    state = settle(host)
+    assert (state["turn"], state["pending"]["agent"], state["pending"]["question"]) == (
         0,
         "buyer",
-        "Order pieces.",
+        "By its rule: Order pieces.",
     )
-    state = play(game, actions[:1])
+    state = play(host, actions[:1])
     assert [(row["agent"], row["by"]) for row in state["history"][:2]] == [
         ("buyer", "person"),
         ("seller", "rule"),
     ]
     assert (state["turn"], state["pending"]["agent"], state["pending"]["time"]) == (2, "buyer", 1.0)
-    assert state["pending"]["mask"] == [
-        int(game.env.simulation.stock + amount < 7) for amount in range(4)
-    ]
-    state = play(game, actions[1:])
+    stock = host.game.env.simulation.stock
+    legal = [amount for amount in range(4) if stock + amount < 7]
+    assert [card["action"] for card in state["pending"]["form"]["cards"]] == legal
+    state = play(host, actions[1:])
     turns, profit = as_by_hand(actions)
     assert state["over"] == "terminated"
     assert state["returns"]["buyer"] == profit == sum(models.rewards_of(turns, "buyer"))
     assert state["returns"]["seller"] == sum(models.rewards_of(turns, "seller"))
-    rewards = [row["reward"] for row in game.timeline if row["agent"] == "buyer"]
+    rewards = [row["reward"] for row in host.game.timeline if row["agent"] == "buyer"]
     assert rewards == models.rewards_of(turns, "buyer")
-    game.handle("buyer", {"do": "undo"})
-    assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
-    assert settle(game)["seats"] == ["buyer"]
-    game.handle("buyer", {"do": "redo"})
-    assert (game.turn, game.over, game.returns) == (16, "terminated", state["returns"])
-    game.handle("buyer", {"do": "undo"})
-    assert play(game, [2])["returns"] == state["returns"]
+    host.handle("buyer", {"do": "undo"})
+    assert (host.game.turn, host.game.over, host.game.now["agent"]) == (14, "", "buyer")
+    assert settle(host)["seats"] == ["buyer"]
+    host.handle("buyer", {"do": "redo"})
+    assert (host.game.turn, host.game.over, host.game.returns) == (
+        16,
+        "terminated",
+        state["returns"],
+    )
+    host.handle("buyer", {"do": "undo"})
+    assert play(host, [2])["returns"] == state["returns"]
 
 
 @pytest.mark.parametrize("forks", [True, False])
-def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks, monkeypatch):
+def test_the_way_back_and_forth_leads_to_the_same_decisions(make_host, forks, monkeypatch):
     monkeypatch.setattr("simenv_marl.seats.play.game.CHECKPOINTS", 4)
-    game = make_game()
-    game.can_fork = forks
-    play(game, [1, 3, 0, 2])
-    before = json.dumps(game.timeline)
+    host = make_host()
+    host.game.can_fork = forks
+    play(host, [1, 3, 0, 2])
+    before = json.dumps(host.game.timeline)
     for turn in (4, 0, 8, 2, 6):
-        game.handle("buyer", {"do": "jump", "n": turn})
-        assert game.turn == turn
-        assert settle(game)["length"] == 8
-    game.jump(7)  # of the seller: nobody plays it
-    assert game.turn == 6
+        host.handle("buyer", {"do": "jump", "n": turn})
+        assert host.game.turn == turn
+        assert settle(host)["length"] == 8
+    host.abandon()
+    host.abandon()
+    host.game.jump(7)  # of the seller: nobody plays it
+    assert host.game.turn == 6
     for do, turn in (("undo", 4), ("redo", 6), ("redo", 8), ("redo", 8)):
-        game.handle("buyer", {"do": do})
-        assert game.turn == turn
-    assert json.dumps(game.timeline) == before
-    old = game.env
-    game.jump(4)
-    assert old is game.root or not old.agents
-    game.decide(2, "person")
-    assert max(game.checkpoints, default=0) <= 4
-    state = play(game, [2, 1, 1, 0, 2])
+        host.handle("buyer", {"do": do})
+        assert host.game.turn == turn
+    assert json.dumps(host.game.timeline) == before
+    old = host.game.env
+    host.abandon()
+    host.game.jump(4)
+    assert old is host.game.root or not old.agents
+    host.abandon()
+    host.game.decide(2, "person")
+    assert max(host.game.checkpoints, default=0) <= 4
+    state = play(host, [2, 1, 1, 0, 2])
     assert state["returns"]["buyer"] == as_by_hand([1, 3, 2, 2, 1, 1, 0, 2])[1]
-    assert len(game.checkpoints) == (4 if forks else 0)
-    assert game.notice == ""
+    assert len(host.game.checkpoints) == (4 if forks else 0)
+    assert host.game.notice == ""
 
 
-def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_game):
+def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_host):
     class Open(Shop):
         """Its agents are known when they decide."""
 
         points = {Shop.order: replace(ORDER, agent=lambda shop: "buyer")}  # noqa: RUF012
 
-    game = make_game(Open, seats=["buier"])
-    while not game.over:
-        settle(game)
-    assert game.notice == "No decision was one of buier; buyer decided."
+    host = make_host(Open, seats=["buier"])
+    while not host.game.over:
+        settle(host)
+    assert host.game.notice == "No decision was one of buier; buyer decided."
 
 
-def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(make_game):
-    game = make_game(seats=())
-    settle(game)
+def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(make_host):
+    host = make_host(seats=())
+    settle(host)
     wrong = [
         ("buyer", {"do": "act", "turn": 0, "action": 4}),
         ("buyer", {"do": "act", "turn": 0, "action": [1]}),
@@ -169,44 +203,44 @@ def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(m
         ("buyer", {}),
     ]
     connection = Connection(*((number, *each) for number, each in enumerate(wrong)))
-    game.serve(connection)
-    replies = {number: reply for number, reply in connection.sent if number is not None}
+    host.serve(connection)
+    replies = {number: reply for number, reply in host.sent if number is not None}
     assert [reply["type"] for reply in replies.values()] == ["error"] * len(wrong)
     texts = [reply["text"] for reply in replies.values()]
     assert "4" in texts[0]
     assert "another decision" in texts[3]
     assert "buyer decides" in texts[4]
     assert "'fly'" in texts[7]
-    assert len(game.timeline) == 1
-    assert not game.root.agents  # it is closed in the end
+    assert len(host.game.timeline) == 1
+    assert not host.game.root.agents  # it is closed in the end
 
 
-def test_futures_are_tried_out_without_moving_the_game(make_game):
-    game = make_game()
-    settle(game)
-    fan = think(game)
+def test_futures_are_tried_out_without_moving_the_game(make_host):
+    host = make_host()
+    settle(host)
+    fan = think(host)
     assert [one["action"] for one in fan["candidates"]] == [None, 0, 1, 2, 3]
-    assert {one["n"] for one in fan["candidates"]} == {16}
+    assert {one["n"] for one in fan["candidates"]} == {4}
     assert fan["rule"] == 2
     rule, two = (one["bands"] for one in fan["candidates"] if one["action"] in (None, 2))
     assert rule == two  # the same futures for all candidates
-    assert fan["measures"][0] == "return"
+    assert fan["measures"][0] == "your points"
     assert len(two) == len(fan["measures"]) > 1
     below, middle, above = two[0]
-    assert len(middle) == 8
+    assert len(middle) == 9  # from now on
     assert all(low <= mid <= high for low, mid, high in zip(below, middle, above, strict=True))
-    assert above[0] > below[0]
-    assert (game.turn, game.env.simulation.day) == (0, 0)
+    assert above[-1] > below[-1]
+    assert (host.game.turn, host.game.env.simulation.day) == (0, 0)
 
 
-def test_without_reseed_there_is_one_future_and_a_note(make_game):
-    game = make_game(FixedShop)
-    settle(game)
-    fan = think(game)
+def test_without_reseed_there_is_one_future_and_a_note(make_host):
+    host = make_host(FixedShop)
+    settle(host)
+    fan = think(host)
     assert {one["n"] for one in fan["candidates"]} == {1}
     assert "reseed" in fan["note"]
-    play(game, [2] * 8)
-    assert game.returns["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
+    play(host, [2] * 8)
+    assert host.game.returns["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
 
 
 def test_observations_and_actions_have_a_form_in_json():
@@ -221,90 +255,87 @@ def test_observations_and_actions_have_a_form_in_json():
     assert action_of(pair, [1]) == [1]  # which the environment refuses
 
 
-def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_game):
-    game = make_game(seats=("seller",))
-    settle(game)
-    assert [one["action"] for one in think(game)["candidates"]] == [None]
-    game.handle("seller", {"do": "try", "turn": 1, "action": [0, 2]})
-    assert [(one["action"], one["n"]) for one in think(game)["candidates"]] == [
-        (None, 16),
-        ([0, 2], 16),
+def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_host):
+    host = make_host(seats=("seller",))
+    settle(host)
+    assert [one["action"] for one in think(host)["candidates"]] == [None]
+    host.handle("seller", {"do": "try", "turn": 1, "action": [0, 2]})
+    assert [(one["action"], one["n"]) for one in think(host)["candidates"]] == [
+        (None, 4),
+        ([0, 2], 4),
     ]
     with pytest.raises(InvalidActionError):
-        game.handle("seller", {"do": "try", "turn": 1, "action": [2, 2]})
-    game.handle("seller", {"do": "horizon", "n": 2})
-    assert len(think(game)["candidates"][0]["bands"][0][1]) == 2
+        host.handle("seller", {"do": "try", "turn": 1, "action": [2, 2]})
+    host.handle("seller", {"do": "horizon", "n": 2})
+    assert (think(host)["horizon"], think(host)["by_time"]) == (2, False)
 
 
-def test_a_decision_ends_the_thinking(make_game):
-    game = make_game()
+def test_a_decision_ends_the_thinking(make_host):
+    host = make_host()
     connection = Connection(
         (1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"})
     )
-    game.serve(connection)
+    host.serve(connection)
     turns = [
         update["turn"]
-        for number, update in connection.sent
+        for number, update in host.sent
         if number is None and update["type"] == "state"
     ]
     assert turns[0] == 0
-    assert len(game.timeline) > 1
+    assert len(host.game.timeline) > 1
 
 
-def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
-    game = make_game(seats=())
-    settle(game)
-    game.handle("buyer", {"do": "delegate", "n": 2})
-    pending = settle(game)["pending"]
-    assert (pending["agent"], pending["space"]) == (
-        "seller",
-        {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]},
-    )
-    game.handle("seller", {"do": "skip"})
-    state = settle(game)
+def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_host):
+    host = make_host(seats=())
+    settle(host)
+    host.handle("buyer", {"do": "delegate", "n": 2})
+    pending = settle(host)["pending"]
+    options = [[each["action"] for each in field["options"]] for field in pending["form"]["fields"]]
+    assert (pending["agent"], options) == ("seller", [[0, 1], [0, 1, 2]])
+    host.handle("seller", {"do": "skip"})
+    state = settle(host)
     assert (state["turn"], state["pending"]["agent"]) == (1, "seller")  # it is its turn
-    game.decide([0, 0], "person")
-    game.handle(None, {"taken": ["seller"]})
-    game.handle("seller", {"do": "skip"})
-    state = settle(game)
+    host.abandon()
+    host.game.decide([0, 0], "person")
+    host.handle(None, {"taken": ["seller"]})
+    host.handle("seller", {"do": "skip"})
+    state = settle(host)
     assert (state["turn"], state["pending"]["agent"]) == (3, "seller")
-    game.decide([0, 0], "person")
-    assert settle(game)["pending"]["agent"] == "buyer"  # the skip ended at the seller's turn
+    host.abandon()
+    host.game.decide([0, 0], "person")
+    assert settle(host)["pending"]["agent"] == "buyer"  # the skip ended at the seller's turn
 
 
-def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch):
-    game = make_game(limit=30.0)
-    assert settle(game)["left"] is None  # nobody is there
-    assert not game.handle(None, {"taken": ["buyer"]})  # the game stays as it is
-    assert 0 < game.snapshot()["left"] <= 30
+def test_after_the_limit_the_rule_decides_and_is_counted(make_host, monkeypatch):
+    host = make_host(limit=30.0)
+    assert settle(host)["left"] is None  # nobody is there
+    assert not host.handle(None, {"taken": ["buyer"]})  # the game stays as it is
+    assert 0 < host.snapshot()["left"] <= 30
     times = iter(range(0, 10**9, 10))
-    monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
-    game.deadline = 0.0
-    game.serve(Connection())
-    late = sum(row.get("by") == "limit" for row in game.timeline)
-    assert game.snapshot()["late"]["buyer"] == late >= 1
-    assert (game.timeline[0]["action"], game.timeline[0]["by"]) == (None, "limit")
+    monkeypatch.setattr("simenv_marl.seats.play.host.monotonic", lambda: next(times))
+    host.deadline = 0.0
+    host.serve(Connection())
+    late = sum(row.get("by") == "limit" for row in host.game.timeline)
+    assert host.snapshot()["late"]["buyer"] == late >= 1
+    assert (host.game.timeline[0]["action"], host.game.timeline[0]["by"]) == (None, "limit")
 
 
-def test_errors_of_the_model_and_of_labels_end_the_episode_and_can_be_undone(make_game):
-    game = make_game(BreakingShop)
-    assert "the till is broken" in play(game, [1, 3])["over"]
-    game.handle("buyer", {"do": "undo"})
-    state = play(game, [2])
-    assert (state["over"], state["turn"], state["pending"]["labels"]["3"]) == (
-        "",
-        2,
-        "order 3 of 3",
-    )
-    assert "division" in play(game, [1])["over"]
-    game.handle("buyer", {"do": "undo"})
-    assert settle(game)["turn"] == 2
+def test_errors_of_the_model_and_of_labels_end_the_episode_and_can_be_undone(make_host):
+    host = make_host(BreakingShop)
+    assert "the till is broken" in play(host, [1, 3])["over"]
+    host.handle("buyer", {"do": "undo"})
+    state = play(host, [2])
+    assert (state["over"], state["turn"]) == ("", 2)
+    assert state["pending"]["form"]["cards"][3]["text"] == "order 3 of 3"
+    assert "division" in play(host, [1])["over"]
+    host.handle("buyer", {"do": "undo"})
+    assert settle(host)["turn"] == 2
 
 
-def test_pictures_are_sent_as_png(make_game):
-    game = make_game()
-    play(game, [1])
-    data = b64decode(settle(game)["picture"]["png"])
+def test_pictures_are_sent_as_png(make_host):
+    host = make_host()
+    play(host, [1])
+    data = b64decode(settle(host)["picture"]["png"])
     assert data.startswith(b"\x89PNG\r\n\x1a\n")
     assert struct.unpack("!II", data[16:24]) == (3, 2)
     begin = data.index(b"IDAT")
@@ -312,37 +343,43 @@ def test_pictures_are_sent_as_png(make_game):
     assert zlib.decompress(data[begin + 4 : begin + 4 + length]) == (b"\0" + b"\1" * 9) * 2
 
 
-def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, tmp_path):
-    game = make_game(seats=(), record=tmp_path / "game.jsonl")
+def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_host, tmp_path):
+    host = make_host(seats=(), record=tmp_path / "game.jsonl")
     for _ in range(3):
-        settle(game)
-        game.decide(3 if game.now["agent"] == "buyer" else [0, 2], "person")
-    game.handle("buyer", {"do": "undo"})
+        settle(host)
+        host.abandon()
+        host.game.decide(3 if host.game.now["agent"] == "buyer" else [0, 2], "person")
+    host.handle("buyer", {"do": "undo"})
     for seat in ("buyer", "seller"):
-        game.delegated[seat] = 100
-    settle(game)
-    game.decide(0, "person") if game.now and game.now["agent"] == "buyer" else None
-    state = settle(game)
+        host.delegated[seat] = 100
+    settle(host)
+    if host.game.now and host.game.now["agent"] == "buyer":
+        host.abandon()
+        host.game.decide(0, "person")
+    state = settle(host)
     assert state["over"]
     found = replay(tmp_path / "game.jsonl", Shop)
     assert {
         agent: float(trajectories.returns[0]) for agent, trajectories in found.items()
     } == state["returns"]
-    rows = [row for row in game.timeline if row["agent"] == "buyer"]
+    rows = [row for row in host.game.timeline if row["agent"] == "buyer"]
     assert found["buyer"].rewards.tolist() == [row["reward"] for row in rows]
     assert found["buyer"].by_rule.tolist() == [row["action"] is None for row in rows]
     assert found["seller"].actions[0].tolist() == [0, 2]
-    assert found["buyer"].observations["stock"].tolist() == [row["values"][1] for row in rows]
+    assert found["buyer"].observations["stock"].tolist() == [
+        row["situation"][1]["number"] for row in rows
+    ]
     assert found["buyer"].terminations[-1]
 
 
-def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_game, tmp_path):
+def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
-    game = make_game(record=path)
+    host = make_host(record=path)
     assert json.loads(path.read_text()) == {"simulation": "shop", "seed": 5, "seats": ["buyer"]}
-    play(game, [2] * 8)
-    game.restart(6)
-    play(game, [1])
+    play(host, [2] * 8)
+    host.abandon()
+    host.game.restart(6)
+    play(host, [1])
     assert replay(path, Shop)["buyer"].seeds == (6,)
     assert replay(path, Shop)["buyer"].truncations.tolist() == [True]
     assert len(replay(path, Shop, episode=0)["buyer"]) == 8
@@ -359,7 +396,7 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ga
         replay(path, Shop)
 
 
-def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
+def test_a_recording_has_agents_that_end_before_others(make_host, tmp_path):
     class Closing(Shop):
         def run(self):
             self.days = 2
@@ -367,8 +404,8 @@ def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
             self.end_agent("seller")
             self.order()
 
-    game = make_game(Closing, record=tmp_path / "game.jsonl")
-    assert play(game, [1, 1, 1])["over"] == "terminated"
+    host = make_host(Closing, record=tmp_path / "game.jsonl")
+    assert play(host, [1, 1, 1])["over"] == "terminated"
     found = replay(tmp_path / "game.jsonl", Closing)
     assert {agent: len(trajectories) for agent, trajectories in found.items()} == {
         "buyer": 3,
@@ -376,12 +413,287 @@ def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
     }
 
 
-def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_game, tmp_path):
-    game = make_game(record=tmp_path / "game.jsonl")
+def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_host, tmp_path):
+    host = make_host(record=tmp_path / "game.jsonl")
     (tmp_path / "game.jsonl").unlink()
     (tmp_path / "game.jsonl").mkdir()
-    state = play(game, [1])
+    state = play(host, [1])
     assert "cannot be written" in state["notice"]
     assert state["turn"] == 2
     with pytest.raises(OptionValueError, match="cannot be written"):
-        make_game(record=tmp_path / "missing" / "game.jsonl")
+        make_host(record=tmp_path / "missing" / "game.jsonl")
+
+
+def test_past_decisions_keep_the_words_of_their_decision(make_host):
+    host = make_host(BreakingShop, unit="day")
+    state = play(host, [2, 1])
+    words = [(row["agent"], row["words"], row["when"]) for row in state["history"]]
+    assert words == [("buyer", "order 2 of 1", "day 0"), ("buyer", "order 1 of 1", "day 1")]
+    host.handle("buyer", {"do": "undo"})
+    state = settle(host)
+    assert [row["words"] for row in state["history"]] == ["order 2 of 1"]
+    assert state["event"] == "buyer went back to decision 2, day 1."
+    host.handle("buyer", {"do": "redo"})
+    assert [row["words"] for row in settle(host)["history"]] == ["order 2 of 1", "order 1 of 1"]
+
+
+def test_values_labels_and_charts_are_those_of_one_decision(make_host):
+    many = replace(
+        ORDER,
+        observation_space=spaces.Box(-np.inf, np.inf, (20,)),
+        observation_space_mapping=lambda shop: [shop.day + place for place in range(20)],
+        observation_labels=[f"value {place}" for place in range(20)],
+    )
+
+    class Wide(Shop):
+        points = {Shop.order: many}  # noqa: RUF012
+
+    host = make_host(Wide)
+    state = play(host, [1, 1])
+    for place, entry in enumerate(state["views"]["buyer"]["situation"]):
+        assert entry["label"] == f"value {place}"
+        assert entry["past"] == [place, place + 1, place + 2]
+
+
+def test_a_display_is_shown_in_place_of_the_observation(make_host):
+    shown = replace(
+        ORDER, question="How much?", display_mapping=lambda shop: {"day": f"{shop.day} d"}
+    )
+
+    class Shown(Shop):
+        points = {Shop.order: shown}  # noqa: RUF012
+
+    host = make_host(Shown)
+    pending = play(host, [1])["pending"]
+    assert (pending["question"], pending["situation"]) == (
+        "How much?",
+        [{"label": "day", "text": "1 d", "number": 1.0}],
+    )
+    assert think(host)["measures"] == ["your points", "day"]
+
+
+def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
+    host = make_host()
+    settle(host)
+    fan = think(host)
+    assert (fan["by_time"], fan["horizon"], fan["done"]) == (True, 8.0, True)
+    host.handle("buyer", {"do": "horizon", "n": 3, "by": "time"})
+    assert think(host)["horizon"] == 3
+
+    class Slow(Shop):
+        def switch(self):
+            time.sleep(3)
+            return super().switch()
+
+    slow = make_host(Slow)
+    settle(slow)
+    time.sleep(0.5)  # its first future computes
+    begin = time.monotonic()
+    slow.exploring.abandon()
+    assert time.monotonic() - begin < 2
+
+
+def test_a_restart_can_be_taken_back(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    host = make_host(record=path)
+    before = play(host, [1, 3])
+    host.handle("buyer", {"do": "restart", "n": None})
+    state = settle(host)
+    assert (state["turn"], state["back"]) == (0, True)
+    assert state["event"].startswith("buyer began another game")
+    host.handle("buyer", {"do": "redo"})
+    assert settle(host) | {"moment": 0, "event": ""} == before | {"moment": 0}
+    play(host, [2])
+    assert [len(each.decisions) for each in read(path)] == [6]
+
+
+def test_a_recording_is_resumed_where_it_stood(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
+    play(host, [1, 3, 2])
+    host.handle("buyer", {"do": "undo"})
+    before = settle(host)
+    with path.open("a") as file:
+        file.write('{"turn": 3, "agent": "bu')  # a crash
+    again = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
+    moments = {"moment": 0, "event": ""}
+    assert settle(again) | moments == before | moments
+    assert {row["by"] for row in before["history"]} == {"person", "policy"}
+    play(again, [0])
+    assert [line["words"] for line in read(path)[-1].decisions if line["by"] == "person"] == [
+        "1", "3", "0",
+    ]  # fmt: skip
+    assert replay(path, Shop)["seller"].actions.tolist() == [[0, 1]] * 3
+    with pytest.raises(OptionValueError, match="its skip_forced is None, not True"):
+        make_host(record=path, options={"skip_forced": True})
+    with pytest.raises(OptionValueError, match="does not repeat"):
+        make_host(BreakingShop, record=path)
+    assert settle(make_host(record=path, new=True))["turn"] == 0
+    assert len(read(path)) == 2
+
+
+def test_a_failed_write_is_made_up_for(make_host, tmp_path, monkeypatch):
+    path = tmp_path / "game.jsonl"
+    host = make_host(record=path)
+    path.rename(tmp_path / "kept")
+    path.mkdir()
+    play(host, [1])
+    path.rmdir()
+    (tmp_path / "kept").rename(path)
+    path.write_text(path.read_text()[:-1])  # without the end of its line
+    play(host, [2])
+    assert [line["turn"] for line in read(path)[0].decisions] == [0, 1, 2, 3]
+
+
+def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
+    class Closing(Shop):
+        def run(self):
+            self.days = 3
+            super().run()
+            self.end_agent("seller")
+            for self.day in range(3, 6):
+                self.order()
+
+    host = make_host(Closing, seats=())
+    states = []
+    while not host.game.over:
+        states.append(settle(host))
+        action = 1 if host.game.now["agent"] == "buyer" else [1, 1]
+        host.abandon()
+        host.game.decide(action, "person")
+    states.append(settle(host))
+    turns = [*range(len(states))]
+    random.Random(1).shuffle(turns)
+    for turn in turns * 2:
+        host.handle("buyer", {"do": "jump", "n": turn})
+        state = settle(host)
+        assert (state["turn"], state["returns"]) == (turn, states[turn]["returns"])
+
+
+def test_a_policy_decides_in_its_seat_and_its_errors_are_told(make_host):
+    async def policy(observation, *, _decision):
+        assert not _decision.in_clone
+        return [1, 2]
+
+    def broken(observation):
+        raise KeyError("seller")
+
+    host = make_host(seats=(), policies={"seller": policy})
+    state = play(host, [1])
+    assert state["policies"]["seller"].endswith("policy")
+    assert [(row["agent"], row["by"], row["action"]) for row in state["history"]] == [
+        ("buyer", "person", 1),
+        ("seller", "policy", [1, 2]),
+    ]
+    host.handle("buyer", {"do": "undo"})  # in a clone, the policy is asked as in the game
+    assert play(host, [2])["history"][1]["action"] == [1, 2]
+    assert (
+        "the policy of seller has failed"
+        in play(make_host(policies={"seller": broken}), [1])["ending"]
+    )
+    assert "illegally" in play(make_host(policies={"seller": lambda _: [5, 5]}), [1])["ending"]
+
+
+def test_joint_and_turn_policies_decide_in_seats(make_host):
+    env = simenv_marl.joint_env(Shop)
+    both = joint_policy(lambda observation: {"buyer": 2, "seller": [0, 1]}, like=env)
+    host = make_host(seats=("buyer",), policies=both)
+    history = play(host, [1, 3])["history"]
+    assert [row["action"] for row in history] == [1, [0, 1], 3, [0, 1]]
+
+
+def test_the_end_is_told_in_words_and_compared_with_the_rule(make_host):
+    host = make_host(options={"max_steps": 6})
+    state = play(host, [1, 3, 0])
+    assert (state["over"], state["ending"]) == ("truncated", "Time is up.")
+    compared = think(host)
+    plain = make_host(options={"max_steps": 6})
+    rule = play(plain, [None] * 0)
+    while not plain.game.over:
+        plain.game.decide(None, "rule")
+    assert compared["type"] == "rule"
+    assert compared["totals"]["buyer"] == plain.game.returns["buyer"]
+    assert len(state["courses"]["buyer"]) == len(compared["courses"]["buyer"]) == 4
+    assert rule["turn"] == 0
+    host.handle("buyer", {"do": "again"})
+    assert settle(host)["turn"] == 0
+
+
+def test_only_who_has_the_tools_can_use_them(make_host):
+    host = make_host(tools="facilitator")
+    play(host, [1])
+    with pytest.raises(InvalidActionError, match="facilitator"):
+        host.handle("buyer", {"do": "undo"})
+    host.handle("", {"do": "undo"})
+    assert settle(host)["event"] == "The facilitator went back to decision 1, time 0."
+    with pytest.raises(OptionValueError, match="tools"):
+        make_host(tools="nurse")
+
+
+def test_a_click_that_is_late_changes_nothing(make_host):
+    host = make_host()
+    state = play(host, [1, 2])
+    for _ in range(2):
+        host.handle("buyer", {"do": "undo", "moment": state["moment"]})
+    assert settle(host)["turn"] == 2
+
+
+def test_numbers_that_json_lacks_never_leave_the_game(make_host):
+    class Wild(Shop):
+        points = {  # noqa: RUF012
+            Shop.order: replace(
+                ORDER,
+                observation_space=spaces.Box(-np.inf, np.inf, (2,)),
+                observation_space_mapping=lambda shop: [np.inf, np.nan],
+                display_mapping=None,
+            )
+        }
+
+    host = make_host(Wild)
+    play(host, [1])
+    host.exploring.wait()
+    for message in [settle(host), *(each for _, each in host.sent)]:
+        json.dumps(jsonable(message), allow_nan=False)
+    assert think(host)["measures"] == ["your points"]
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "text"),
+    [
+        (spaces.Box(0.0, 1.0, (1,)), [7], "Enter a number from 0 to 1, not 7."),
+        (spaces.Box(0, 5, (2,), int), [2, 0.5], "Enter a whole number from 0 to 5, not 0.5."),
+        (
+            spaces.Box(0.0, np.inf, (1,)),
+            ["Infinity"],
+            "Enter a number of at least 0, not 'Infinity'.",
+        ),
+        (spaces.Discrete(3), 9, "Choose one of these answers: 0, 1, 2 (not 9)."),
+        (spaces.MultiDiscrete([2, 2]), [0, 4], "Choose one of 0, 1, not 4."),
+        (spaces.Dict({"a": spaces.Discrete(2)}), {"a": 3}, "Choose one of 0, 1, not 3."),
+        (spaces.Text(3), "four", "Enter at most 3 characters, not 'four'."),
+    ],
+)
+def test_what_is_wrong_with_an_action_is_said_in_its_words(space, action, text):
+    form = form_of(space, None, None)
+    assert complaint_about(form, action)["text"] == text
+    legal = jsonable(space.sample())
+    assert complaint_about(form, legal) == {} or "cards" in form
+    assert words_of(form, legal)
+
+
+def test_masked_actions_are_hidden_and_values_have_four_digits():
+    form = form_of(spaces.Discrete(4), np.array([1, 0, 1, 0], np.int8), {0: "no", 2: "two"})
+    assert form == {"cards": [{"action": 0, "text": "no"}, {"action": 2, "text": "two"}]}
+    texts = [shown(value) for value in (1 / 3, 1234.56, 123456.7, 1e-7, 12, True, np.float32(0.1))]
+    assert texts == ["0.3333", "1235", "123457", "1e-07", "12", "yes", "0.1"]
+
+
+def test_a_game_that_is_over_is_resumed_at_its_end(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    over = play(make_host(record=path), [2] * 8)
+    moments = {"moment": 0, "event": ""}
+    again = make_host(seats=(), record=path)  # with the recorded seats
+    assert settle(again) | moments == over | moments
+    again.handle("buyer", {"do": "undo"})
+    assert settle(again)["turn"] == 14
+    assert settle(make_host(record=path))["turn"] == 14

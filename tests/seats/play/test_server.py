@@ -25,7 +25,13 @@ pytest.importorskip("uvicorn")
 client = pytest.importorskip("websockets.sync.client")
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
+from simenv_marl.core import pack_plainly, unpack  # noqa: E402
+from simenv_marl.errors import OptionValueError  # noqa: E402
+from simenv_marl.seats.play import play  # noqa: E402
+from simenv_marl.seats.play.host import Rules  # noqa: E402
 from simenv_marl.seats.play.server import Table  # noqa: E402
+from simenv_marl.seats.play.start import find_game  # noqa: E402
+from tests.seats.play.worlds import Shop, five  # noqa: E402
 
 SHOP = "tests.seats.play.worlds:Shop"
 
@@ -41,23 +47,29 @@ class Server:
             "simenv_marl",
             "play",
             simulation,
-            "--port",
-            "0",
+            *(() if "--port" in arguments else ("--port", "0")),
             *arguments,
         ]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env=environment, cwd=ROOT, start_new_session=True,
         )  # fmt: skip
-        self.base = re.search(r"http://\S+", self.process.stdout.readline())[0]
+        line = self.process.stdout.readline()
+        self.resumed = "goes on" in line
+        if self.resumed:
+            line = self.process.stdout.readline()
+        self.base = re.search(r"http://\S+", line)[0]
         self.host = self.base.split("/")[2]
-        self.links = {}
+        self.links, self.facilitator = {}, ""
 
     def keys(self, *seats):
         while not self.links.keys() >= set(seats):
             link = self.process.stdout.readline().strip()
-            seat, key = re.search(r"/seat/(\w+)\?key=(\w+)$", link).groups()
-            self.links[seat] = key
+            if "/facilitator" in link:
+                self.facilitator = link.removeprefix(self.base)
+            else:
+                seat, key = re.search(r"/seat/(\S+)\?key=(\w+)$", link).groups()
+                self.links[seat] = key
         return [self.links[seat] for seat in seats]
 
     def page(self, seat="", key="", **options):
@@ -134,8 +146,9 @@ def buyer(page):
 def test_two_people_play_and_a_spectator_sees_it():
     server = Server("--seed", "5")  # which nobody else has used
     buyer, seller, spectator = server.page("buyer"), server.page("seller"), server.page()
-    everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
-    spectator.wait("people", lambda people: people == everybody)
+    everybody = {"buyer": 1, "seller": 1}
+    people = spectator.wait("people", lambda people: people["taken"] == everybody)
+    assert (people["spectators"], sorted(people["opened"])) == (1, ["buyer", "seller"])
     buyer.send(do="act", turn=0, action=2)
     assert seller.wait_for_turn(1)["pending"]["agent"] == "seller"
     seller.send(do="act", turn=1, action=[1, 1])
@@ -313,6 +326,78 @@ def test_what_cannot_be_played_is_told(arguments, told, capsys):
     assert main(["play", *arguments]) == 2
     assert told in capsys.readouterr().err
     assert set(multiprocessing.active_children()) <= before
+
+
+def test_the_function_takes_what_simulate_takes(monkeypatch, tmp_path):
+    made = []
+
+    def serve(make, **options):
+        game, rules = unpack(pack_plainly(make))()  # as in the process of the game
+        made.append((game.seats, game.policies.keys(), game.options, rules.title, options))
+        game.close()
+        return "The returns: none"
+
+    monkeypatch.setattr("simenv_marl.seats.play.server.serve", serve)
+    record = tmp_path / "game.jsonl"
+    told = play(Shop, {"seller": five}, seats=["buyer"], max_steps=5, record=record, port=0)
+    assert told == "The returns: none"
+    assert made == [
+        (
+            ["buyer"],
+            {"seller"},
+            {"max_steps": 5},
+            "Shop",
+            {"host": "127.0.0.1", "port": 0, "record": record},
+        )
+    ]
+
+
+def test_a_game_of_the_command_line_has_policies():
+    found = {"shop": Shop, "five": five, "both": {"seller": five}}
+    options = {"rules": Rules(""), "seed": 1, "name": "", "seats": ()}
+    for text in ("seller=five", "both"):
+        game, _ = find_game(found.get, "shop", [text], **options)
+        assert game.agents == {"buyer": "", "seller": "five"}
+        game.close()
+    with pytest.raises(OptionValueError, match="AGENT=five"):
+        find_game(found.get, "shop", ["five"], **options)
+
+
+def test_a_resumed_game_has_the_same_links(tmp_path):
+    arguments = "--seed", "5", "--record", str(tmp_path / "game.jsonl")
+    server = Server(*arguments)
+    buyer = server.page("buyer")
+    buyer.send(do="act", turn=0, action=2)
+    buyer.wait_for_turn(1)
+    keys = server.keys("buyer", "seller")
+    os.killpg(server.process.pid, signal.SIGKILL)
+    server.process.communicate()
+    server = Server(*arguments)
+    assert (server.resumed, server.keys("buyer", "seller")) == (True, keys)
+    assert server.page("buyer").wait("state")["history"][0]["action"] == 2
+    assert server.end()[0] == 0
+    assert (tmp_path / "game.jsonl.keys").stat().st_mode & 0o077 == 0
+
+
+def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):
+    lobby = page()
+    lobby.send(do="claim", key="")
+    lobby.wait("error")
+    lobby.socket.send(json.dumps({"do": "claim", "seat": "seller"}))
+    path = lobby.wait("link")["path"]
+    seller = page("seller", path.partition("key=")[2])
+    assert seller.wait("you")["seat"] == "seller"
+    lobby.socket.send(json.dumps({"do": "claim", "seat": "seller"}))
+    assert "link of this seat" in lobby.wait("error")["text"]
+
+
+def test_a_number_that_is_too_large_never_returns_as_infinity(buyer):
+    buyer.socket.send(
+        json.dumps({"key": buyer.key, "do": "act", "turn": 0, "action": 0}).replace(
+            ": 0}", ": 1e999}"
+        )
+    )
+    assert "1e999" in buyer.wait("error")["text"]
 
 
 def test_a_missing_extra_is_told(monkeypatch, capsys):

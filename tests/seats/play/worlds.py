@@ -85,6 +85,27 @@ class FixedShop(Shop):
     reseed = None
 
 
+class SlowShop(Shop):
+    """It takes two seconds to go on."""
+
+    points = {Shop.order: ORDER}  # noqa: RUF012
+
+    def switch(self):
+        time.sleep(2)
+        return super().switch()
+
+
+class OddShop(Shop):
+    """Its buyer has a name with special characters."""
+
+    points = {Shop.order: replace(ORDER, agent="../a b/ü?&<i>")}  # noqa: RUF012
+
+
+def five(observation):
+    """Bring five crates to the market."""
+    return 5
+
+
 class ClosedShop(Shop):
     """It takes some time to close."""
 

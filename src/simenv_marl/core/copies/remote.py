@@ -255,6 +255,11 @@ class RemoteSession(BaseSession):
             " the result"
         )
 
+    @property
+    def process(self) -> int:
+        """The number of its process, which may be killed while it computes."""
+        return self._fork.process
+
     # -- requests ----------------------------------------------------------------------------------
 
     def move(self, method: Callable[..., Result], *args: object) -> Result:

@@ -1,23 +1,12 @@
-"""The process of a game: its simulation, its decisions, and checkpoints to go back to.
+"""A game: an episode with its past, and checkpoints to go back to."""
 
-The server sends triples: the number of a connection, its seat (None: the server itself), and a dict
-from the page (None: the end). The game answers with pairs: the number, and an error or None. Pairs
-with the number None are for all pages. Work that takes time is a generator, which the game leaves
-between two steps of the simulation when a message has come.
-"""
-
-import json
-import signal
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final, NamedTuple, NotRequired, TypedDict
 
 from ... import aec_env, clone
+from ...core import EpisodeOptions, Points, Policy
 from ...envs import SimulationAECEnv
 from ...errors import (
     InvalidActionError,
@@ -25,27 +14,21 @@ from ...errors import (
     SimEnvError,
     describe_error,
     did_you_mean,
-    short_repr,
 )
-from ...simulation import Action, Model, check_seconds
-from ..descriptions import JSON, at_decision
-from .forms import Message, action_of, jsonable, pending_decision, picture_of
-from .futures import MOST_MEASURES, Futures
+from ...simulation import Action, Model
+from ..descriptions import at_decision
+from .deciders import Deciders
+from .forms import Message, action_of, jsonable, pending_decision, words_of
+from .recording import Episode, Recorder, read
 
 CHECKPOINTS: Final = 24
 """The largest number of checkpoints. Each one is a process."""
 
-MOST_ROWS: Final = 150
-"""The largest number of decisions that the page receives."""
-
-PAUSE: Final = 0.2
-"""The seconds between two states that the page receives while the rule plays."""
-
-RECORDED: Final = ("turn", "agent", "action", "by", "seen", "time")
+RECORDED: Final = ("turn", "agent", "number", "action", "words", "by", "seen", "time")
 """The keys of a decision in a recording."""
 
-ENDS: Final = ("", "terminated", "truncated")
-"""The values of ``Game.over`` without an error."""
+REPEATED: Final = ("agent", "before", "seen", "time")
+"""The keys of a decision that are the same when it is reached again."""
 
 
 class Row(TypedDict):
@@ -53,17 +36,21 @@ class Row(TypedDict):
 
     turn: int
     agent: str
+    number: int
+    """The number of the decision among those of its agent, from 1."""
     before: float
     """The agent's return before the decision."""
     seen: str
     """The digest of the observation."""
     time: float | None
-    values: list[JSON]
-    """The first entries of the observation."""
+    situation: list[Message]
+    form: Message
     action: NotRequired[Action]
     """The action as JSON; None for the rule. A pending decision has none."""
     by: NotRequired[str]
-    """Who decided: "person", "rule", or "limit" for the rule after the time limit."""
+    """Who decided: "person", "policy", "rule", or "limit" for the rule after the time limit."""
+    words: NotRequired[str]
+    """The action in the words of the decision. Of the rule, "" until its action is known."""
     reward: NotRequired[float | None]
 
 
@@ -81,27 +68,26 @@ class Game:
     Attributes:
         simulation: The simulation, as ``aec_env`` takes it.
         name: The name of the simulation.
-        seats: The agents that people play; none: all agents.
+        seats: The agents that people play; none: all agents without a policy.
         seed: The seed of the episode.
-        limit: The time limit of a person's decision, in seconds.
-        record: The file of the recording.
+        points: The decision points, as ``aec_env`` takes them.
+        policies: Policies of agents that no person plays, as ``simulate`` takes them.
+        options: The options of ``aec_env``.
+        record: The file of the recording. The last episode in it goes on.
+        new: Whether to begin another episode instead.
         can_fork: Whether checkpoints can be made. Else the way back is a replay.
-        horizon: The number of an agent's decisions in its futures.
-        occupied: The seats that people have.
         checkpoints: The checkpoints, by turn.
         root: The environment that was made for the game.
         env: The environment at the pending decision: ``root`` or a clone.
-        agents: The known agents.
+        agents: The known agents, and the name of the policy that decides for each, or "".
         timeline: The decisions, also those after the pending one that were undone.
         turn: The place of the pending decision in the timeline.
+        moment: A number that each change of the pending decision increases.
         now: The pending decision as JSON; None at the end.
         over: Why the episode is over: "terminated", "truncated" or an error. "": it is not.
         returns: The return of each agent so far.
         latest: The turn of the latest decision of each agent.
-        futures: The futures of the pending decision, once they are explored.
-        deadline: When the rule decides, in seconds of ``monotonic``; None: there is no limit.
-        delegated: How many of its next decisions each seat leaves to the rule.
-        skipping: The seat until whose next decision the rule plays for free seats.
+        previous: The episode before the latest restart, until a decision is taken.
         notice: A warning for the page.
     """
 
@@ -109,49 +95,141 @@ class Game:
     name: str
     seats: Sequence[str]
     seed: int
-    limit: float | None = None
+    points: Points = None
+    policies: Mapping[Any, Policy] = field(default_factory=dict)
+    options: EpisodeOptions = field(default_factory=EpisodeOptions)
     record: Path | None = None
+    new: bool = False
     can_fork: bool = True
-    horizon: int = 8
-    occupied: Collection[str] = ()
     checkpoints: dict[int, Checkpoint] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Begin an episode.
+        """Begin an episode, or go on with the recorded one.
 
         Raises:
             OptionValueError: An argument has an invalid value, or the episode cannot begin.
+            StoreError: The recording cannot be read.
         """
-        if self.limit is not None:
-            check_seconds(self.limit, "limit")
-        modes = aec_env(self.simulation).metadata["render_modes"]
-        mode = next((mode for mode in ("rgb_array", "ansi") if mode in modes), None)
-        self.root = self.env = aec_env(self.simulation, render_mode=mode)
+        self.root = self.env = self.make_env()
+        self.deciders = Deciders(self.simulation, self.policies, self.points, self.options)
+        recorded = []
+        if self.record is not None and self.record.exists() and not self.new:
+            recorded = read(self.record)
+        if recorded and not self.seats:
+            self.seats = recorded[-1].header.get("seats", ())
+        roster = self.root.session.plan.roster
         agents: list[str] = getattr(self.root, "possible_agents", [])
         for seat in set(self.seats).difference(agents or self.seats):
             raise OptionValueError(
                 f"there is no agent {seat!r}; the agents are {agents}{did_you_mean(seat, agents)}"
             )
-        self.agents = dict.fromkeys(self.seats or agents)
-        self.restart(self.seed)
-        if self.over or self.notice:
+        self.agents: dict[str, str] = {}
+        named = [key for key in self.policies if isinstance(key, str) and "." not in key]
+        for agent in dict.fromkeys([*self.seats, *agents, *named]):
+            point = roster.get(agent)
+            self._meet(agent, "" if point is None else point.hook.name)
+        self.recorder = None if self.record is None else Recorder(self.record)
+        self.previous: Episode | None = None
+        self.timeline: list[Row] = []
+        self.turn = 0
+        self.moment = 0
+        self.now: Message | None = None
+        if recorded:
+            self._resume(recorded)
+        else:
+            self.restart(self.seed)
+            self.previous = None
+        if self.notice or (self.over and not recorded):
             raise OptionValueError(f"{self.name} cannot be played: {self.over or self.notice}")
 
+    def make_env(self) -> SimulationAECEnv:
+        """Make an environment of the game's simulation."""
+        modes = aec_env(self.simulation, self.points).metadata["render_modes"]
+        shown = [mode for mode in ("rgb_array", "ansi") if mode in modes]
+        options = EpisodeOptions(render_mode=shown[0] if shown else None)
+        return aec_env(self.simulation, self.points, **(options | self.options))
+
+    def plays(self, agent: str) -> bool:
+        """Return whether the agent's seat is for a person."""
+        return agent in self.seats if self.seats else not self.agents.get(agent)
+
+    def close(self) -> None:
+        """Close all environments."""
+        self.forget(-1)
+        self.env.close()
+        self.root.close()
+
+    # -- episodes ---------------------------------------------------------------------------------
+
     def restart(self, seed: int) -> None:
-        """Begin another episode."""
+        """Begin another episode. ``go_back`` returns to the present one."""
+        lines = [line_of(row) for row in self.timeline if "action" in row]
+        self.previous = Episode(self._header(), lines, self.turn)
+        self._begin(seed)
+        self._record(self._header())
+
+    def go_back(self) -> None:
+        """Return to the episode before the latest restart."""
+        if self.previous is not None:
+            previous, self.previous = self.previous, None
+            self._load(previous)
+            self._record({"back": True, "turn": self.turn})
+
+    def _header(self) -> Message:
+        header: Message = {"simulation": self.name, "seed": self.seed, "seats": list(self.seats)}
+        for name, value in self.options.items():
+            if name in ("skip_forced", "max_steps"):
+                header[name] = value
+        return header
+
+    def _begin(self, seed: int) -> None:
         self.forget(-1)
         self.seed = seed
         self.notice = ""
-        self.timeline: list[Row] = []
-        self._stop_rule()
+        self.timeline = []
         self._return_to(0)
-        self._record(
-            {
-                "simulation": self.name,
-                "seed": seed,
-                "seats": list(self.agents),
-            }
-        )
+
+    def _resume(self, episodes: list[Episode]) -> None:
+        """Go on with the last recorded episode.
+
+        Raises:
+            OptionValueError: The simulation does not repeat it.
+        """
+        latest = episodes[-1]
+        problem = f"the recording {self.record} cannot be resumed"
+        remedy = "begin another game by --new, or use another file"
+        header = self._header()
+        for key in ("simulation", "skip_forced", "max_steps"):
+            recorded, present = latest.header.get(key), header.get(key)
+            if str(recorded).replace(":", ".") != str(present).replace(":", "."):
+                raise OptionValueError(
+                    f"{problem}: its {key} is {recorded}, not {present}; {remedy}"
+                )
+        try:
+            self._load(latest)
+        except InvalidActionError as error:
+            raise OptionValueError(f"{problem}: {error}; {remedy}") from error
+        if len(episodes) > 1 and not latest.decisions:
+            self.previous = episodes[-2]
+
+    def _load(self, episode: Episode) -> None:
+        """Repeat the decisions of an episode.
+
+        Raises:
+            InvalidActionError: The simulation does not repeat it.
+        """
+        self._begin(episode.header["seed"])
+        for line in episode.decisions:
+            row = None if self.now is None else self.timeline[self.turn]
+            if row is None or (row["agent"], row["seen"]) != (line["agent"], line["seen"]):
+                raise InvalidActionError(
+                    f"the simulation does not repeat decision {line['turn']} of {line['agent']}"
+                )
+            self._take(line["action"], line["by"])
+        if episode.turn != self.turn:
+            self._go_to(episode.turn)
+
+    # -- decisions --------------------------------------------------------------------------------
 
     def decide(self, action: Action, by: str) -> None:
         """Take the pending decision.
@@ -163,13 +241,8 @@ class Game:
         Raises:
             InvalidActionError: The action is not legal. The decision stays pending.
         """
-        row = self.timeline[self.turn]
-        self._step(row["agent"], action)
-        self.forget(self.turn)
-        del self.timeline[self.turn + 1 :]
-        row |= {"action": action, "by": by, "reward": None}
-        line = {key: value for key, value in row.items() if key in RECORDED}
-        self._arrive(self.turn + 1)
+        line = line_of(self._take(action, by))
+        self.previous = None
         if self.over:
             line |= {"end": self.over, "returns": self.returns}
             absent = [seat for seat in self.seats if seat not in self.latest]
@@ -179,36 +252,32 @@ class Game:
                 self.notice = f"No decision was one of {names}; {others} decided."
         self._record(line)
 
-    def jump(self, turn: int) -> None:
-        """Go to the end, or to the latest decision of a person up to a turn.
+    def answer(self) -> None:
+        """Take the pending decision by the policy of its agent, or else by the rule."""
+        row = self.timeline[self.turn]
+        action: Action = None
+        by = "rule"
+        if self.agents.get(row["agent"]):
+            by = "policy"
+            try:
+                action = self.deciders.answer(self.env)
+            except Exception as error:
+                self._fail(f"the policy of {row['agent']} has failed: {describe_error(error)}")
+                return
+        try:
+            self.decide(action, by)
+        except InvalidActionError as error:
+            self._fail(f"the policy of {row['agent']} has answered illegally: {error}")
 
-        The way leads from the nearest checkpoint, or from the beginning.
-        """
-        if turn < len(self.timeline) or "action" not in self.timeline[-1]:
-            stops = [row["turn"] for row in self.timeline if self.plays(row["agent"])] or [0]
-            earlier = [stop for stop in stops if stop <= turn]
-            turn = max(earlier, default=stops[0])
-        starts = [start for start in self.checkpoints if start <= turn]
-        self._return_to(max(starts, default=0))
-        for row in self.timeline[self.turn : turn]:
-            if self.over or self.timeline[self.turn] is not row:
-                break  # the simulation does not repeat itself
-            self._step(row["agent"], row["action"])
-            self._arrive(self.turn + 1)
-        self._stop_rule()
-
-    def forget(self, turn: int) -> None:
-        """Close the checkpoints after a turn."""
-        for later in [start for start in self.checkpoints if start > turn]:
-            self.checkpoints.pop(later).env.close()
-
-    def plays(self, agent: str) -> bool:
-        """Return whether the agent's seat is for a person."""
-        return not self.seats or agent in self.seats
-
-    def _stop_rule(self) -> None:
-        self.delegated: Counter[str] = Counter()
-        self.skipping: str | None = None  # the seat for whose next decision the rule plays on
+    def _take(self, action: Action, by: str) -> Row:
+        row = self.timeline[self.turn]
+        self._step(row["agent"], action)
+        self.forget(self.turn)
+        del self.timeline[self.turn + 1 :]
+        words = "" if action is None else words_of(row["form"], action)
+        row |= {"action": action, "by": by, "words": words, "reward": None}
+        self._arrive(self.turn + 1)
+        return row
 
     def _step(self, agent: str, action: Action) -> None:
         space = self.env.action_space(agent)
@@ -225,8 +294,54 @@ class Game:
         except InvalidActionError:
             raise
         except Exception as error:
-            self.over = describe_error(error)
+            self._fail(describe_error(error))
             return None
+
+    def _fail(self, problem: str) -> None:
+        self.over = problem
+        self.now = None
+        self.moment += 1
+
+    # -- the way back -----------------------------------------------------------------------------
+
+    def jump(self, turn: int) -> None:
+        """Go to the end, or to the latest decision of a person up to a turn."""
+        before = self.turn
+        if turn < len(self.timeline) or "action" not in self.timeline[-1]:
+            stops = [row["turn"] for row in self.timeline if self.plays(row["agent"])] or [0]
+            earlier = [stop for stop in stops if stop <= turn]
+            turn = max(earlier, default=stops[0])
+        self._go_to(turn)
+        if self.turn != before:
+            self._record({"turn": self.turn})
+
+    def _go_to(self, turn: int) -> None:
+        """Go to a turn from the nearest checkpoint, or from the beginning."""
+        starts = [start for start in self.checkpoints if start <= turn]
+        self._return_to(max(starts, default=0))
+        for row in self.timeline[self.turn : turn]:
+            if self.over or self.timeline[self.turn] is not row:
+                break  # the simulation does not repeat itself
+            self._step(row["agent"], row["action"])
+            self._arrive(self.turn + 1)
+
+    def forget(self, turn: int) -> None:
+        """Close the checkpoints after a turn."""
+        for later in [start for start in self.checkpoints if start > turn]:
+            self.checkpoints.pop(later).env.close()
+
+    def make_checkpoint(self) -> None:
+        """Make a checkpoint of the pending decision. If there are too many, thin out the oldest."""
+        if not self.can_fork or self.turn in self.checkpoints:
+            return
+        try:
+            twin = clone(self.env, method="fork")
+            self.checkpoints[self.turn] = Checkpoint(twin, {**self.returns})
+        except SimEnvError:
+            self.can_fork = False
+        if len(self.checkpoints) > CHECKPOINTS:
+            for turn in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]:
+                self.checkpoints.pop(turn).env.close()
 
     def _return_to(self, turn: int) -> None:
         """Continue at a checkpoint. The beginning needs none."""
@@ -246,18 +361,18 @@ class Game:
             previous.close()
         self._arrive(turn)
 
+    # -- arrivals ---------------------------------------------------------------------------------
+
     def _arrive(self, turn: int) -> None:
         """Note the reward of the agent that decides next, and the agents that have ended."""
         self.turn = turn
-        self.now: Message | None = None
-        self.deadline: float | None = None
-        self.futures: Futures | None = None
-        self.picture: Message | None = None
+        self.moment += 1
+        self.now = None
         end = ""
         while self.env.agents and not self.over:
             agent = self.env.agent_selection
-            _, reward, terminated, truncated, _ = self.env.last(observe=False)
-            self._add_reward(agent, reward)
+            _, reward, terminated, truncated, info = self.env.last(observe=False)
+            self._add_reward(agent, reward, info)
             if not (terminated or truncated):
                 self._note_pending(agent)
                 return
@@ -265,13 +380,21 @@ class Game:
             self.env.step(None)
         self.over = self.over or end
 
-    def _add_reward(self, agent: str, reward: float) -> None:
+    def _add_reward(
+        self,
+        agent: str,
+        reward: float,
+        info: Mapping[str, Any],
+    ) -> None:
         """Add the reward of an agent's previous decision to its return."""
         self.returns.setdefault(agent, 0.0)
-        if agent in self.latest:
-            row = self.timeline[self.latest[agent]]
-            row["reward"] = reward
-            self.returns[agent] = row["before"] + reward
+        if agent not in self.latest:
+            return
+        row = self.timeline[self.latest[agent]]
+        row["reward"] = reward
+        self.returns[agent] = row["before"] + reward
+        if row.get("action", "") is None and "rule_action" in info:
+            row["words"] = words_of(row["form"], jsonable(info["rule_action"]))
 
     def _note_pending(self, agent: str) -> None:
         """Note the pending decision in the timeline, which may have it with its action."""
@@ -281,14 +404,16 @@ class Game:
         row: Row = {
             "turn": self.turn,
             "agent": agent,
+            "number": pending["number"],
             "before": self.returns[agent],
             "seen": pending["seen"],
             "time": pending["time"],
-            "values": [value for _, value in pending["observation"][:MOST_MEASURES]],
+            "situation": pending["situation"],
+            "form": pending["form"],
         }
         if self.turn < len(self.timeline):
-            previous = self.timeline[self.turn]
-            if previous | row != previous:
+            former = self.timeline[self.turn]
+            if any(row[key] != former[key] for key in REPEATED):
                 del self.timeline[self.turn :]
                 self.notice = (
                     "The simulation does not repeat itself: its randomness does not all come from"
@@ -298,219 +423,18 @@ class Game:
             self.timeline.append(row)
         self.now = pending
         self.latest[agent] = self.turn
-        if not self.seats:
-            self.agents[agent] = None
+        if agent not in self.agents:
+            deciding = self.env.episode.agents[agent]
+            self._meet(agent, deciding.point.hook.name)
+
+    def _meet(self, agent: str, point: str) -> None:
+        self.agents[agent] = self.deciders.name_for(agent, point)
 
     def _record(self, line: Message) -> None:
-        """Append a line to the recording, which is closed in between: clones need not copy it."""
-        if self.record is None:
-            return
-        try:
-            with self.record.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(jsonable(line)) + "\n")
-        except OSError as error:
-            self.notice = f"The recording {self.record} cannot be written: {error}"
-
-    # -- messages ----------------------------------------------------------------------------------
-
-    def serve(self, connection: Connection) -> None:
-        """Answer messages until the end, or until the connection is closed."""
-        with suppress(EOFError):
-            while True:
-                self._work_until_changed(connection)
-        self.root.close()
-
-    def _work_until_changed(self, connection: Connection) -> None:
-        for update in self.work():
-            if update is not None:
-                connection.send((None, update))
-            if self._changed(connection, 0.0):
-                return
-        while not self._changed(connection, self._seconds_left()):
-            pass
-
-    def _changed(self, connection: Connection, timeout: float | None) -> bool:
-        """Decide if the time is up, else answer a message; return whether the game has changed.
-
-        Raises:
-            EOFError: The message is the end, or the connection is closed.
-        """
-        if self.now is not None and self._seconds_left() == 0.0:
-            self.decide(None, "limit")
-            return True
-        if not connection.poll(timeout):
-            return False
-        number, seat, message = connection.recv()
-        if message is None:
-            raise EOFError
-        reply = None
-        try:
-            changed = self.handle(seat, message)
-        except Exception as error:
-            changed = not isinstance(error, ValueError)
-            reply = {"type": "error", "text": _message_of(error)}
-        connection.send((number, reply))
-        return changed
-
-    def handle(self, seat: str | None, message: Message) -> bool:
-        """Handle a message from a seat, or from the server if that is None.
-
-        Returns:
-            Whether the message has changed the game.
-
-        Raises:
-            InvalidActionError: It is not the seat's turn, or the action is not legal.
-            OptionValueError: The message is not one of the page.
-        """
-        if seat is None:
-            self.occupied = message["taken"]
-            self._start_clock()
-            return self.skipping is not None
-        if message.get("do") in ("act", "rule", "try"):
-            self._check_turn(message.get("turn"), seat)
-        match message:
-            case {"do": "rule"}:
-                self.decide(None, "rule")
-            case {"do": "act", "action": action} if action is not None:
-                self.decide(action, "person")
-            case {"do": "try", "action": action} if action is not None:
-                if self.futures is not None:
-                    self.futures.add(action)
-            case {"do": "delegate", "n": int(number)} if 0 <= number <= 100_000:
-                self.delegated[seat] = number
-                self.skipping = None
-            case {"do": "skip"}:
-                self.skipping = seat
-            case {"do": "undo"}:
-                earlier = self._turns(seat, range(self.turn))
-                self.jump(max(earlier, default=0))
-            case {"do": "redo"}:
-                end = len(self.timeline)
-                later = self._turns(seat, range(self.turn + 1, end))
-                self.jump(min(later, default=end))
-            case {"do": "jump", "n": int(number)} if 0 <= number <= len(self.timeline):
-                self.jump(number)
-            case {"do": "restart", "n": int(seed)} if 0 <= seed < 2**31:
-                self.restart(seed)
-            case {"do": "horizon", "n": int(number)} if 0 < number <= 100:
-                self.horizon = number
-                self.futures = None
-            case _:
-                raise OptionValueError(f"the game cannot follow {short_repr(message)}")
-        return True
-
-    def _turns(self, seat: str, turns: range) -> list[int]:
-        return [turn for turn in turns if self.timeline[turn]["agent"] == seat]
-
-    def _check_turn(self, turn: object, seat: str) -> None:
-        if self.now is None or turn != self.turn:
-            raise InvalidActionError("another decision is pending by now")
-        if self.now["agent"] != seat:
-            raise InvalidActionError(f"it is not your turn: {self.now['agent']} decides")
-
-    def _start_clock(self) -> None:
-        """Begin the time limit of the pending decision, once a person is there."""
-        is_stopped = self.now is not None and self.deadline is None
-        if self.limit and self.occupied and is_stopped:
-            self.deadline = monotonic() + self.limit
-
-    def _seconds_left(self) -> float | None:
-        if self.deadline is None:
-            return None
-        return max(0.0, self.deadline - monotonic())
-
-    # -- work --------------------------------------------------------------------------------------
-
-    def work(self) -> Iterator[Message | None]:
-        """Let the rule decide for seats without a person; then explore the futures.
-
-        Yields:
-            None after each step of a simulation, or a message for all pages.
-        """
-        latest = monotonic()
-        while self.now is not None and self._leaves_to_rule(self.now["agent"]):
-            self.decide(None, "rule")
-            yield None
-            if monotonic() > latest + PAUSE:
-                latest = monotonic()
-                yield self.snapshot()
-        if self.now is not None:
-            self._make_checkpoint()
-            if self.futures is None:
-                self.futures = Futures(
-                    self.env,
-                    self.now,
-                    self.turn,
-                    self.horizon,
-                    self.seed,
-                )
-            self._start_clock()
-        if self.over in ENDS:
-            self.picture = picture_of(self.env)
-        yield self.snapshot()
-        if self.futures is not None:
-            yield from self.futures.explore()
-
-    def _leaves_to_rule(self, agent: str) -> bool:
-        if not self.plays(agent):
-            return True
-        if self.skipping == agent:
-            self.skipping = None
-        if self.delegated[agent]:
-            self.delegated[agent] -= 1
-            return True
-        return self.skipping is not None and agent not in self.occupied
-
-    def _make_checkpoint(self) -> None:
-        """Make a checkpoint of the pending decision. If there are too many, thin out the oldest."""
-        if not self.can_fork or self.turn in self.checkpoints:
-            return
-        try:
-            twin = clone(self.env, method="fork")
-            self.checkpoints[self.turn] = Checkpoint(twin, {**self.returns})
-        except SimEnvError:
-            self.can_fork = False
-        if len(self.checkpoints) > CHECKPOINTS:
-            for turn in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]:
-                self.checkpoints.pop(turn).env.close()
-
-    def snapshot(self) -> Message:
-        """Return the message with the state of the game, without its futures."""
-        return {
-            "type": "state",
-            "simulation": self.name,
-            "seed": self.seed,
-            "seats": list(self.agents),
-            "turn": self.turn,
-            "length": sum("action" in row for row in self.timeline),
-            "pending": self.now,
-            "over": self.over,
-            "returns": self.returns,
-            "history": self.timeline[max(0, self.turn - MOST_ROWS) : self.turn + 1],
-            "left": self._seconds_left(),
-            "late": Counter(row["agent"] for row in self.timeline if row.get("by") == "limit"),
-            "picture": self.picture,
-            "notice": self.notice,
-        }
+        if self.recorder is not None:
+            self.notice = self.recorder.add(line) or self.notice
 
 
-def _message_of(error: Exception) -> str:
-    if isinstance(error, SimEnvError):
-        return str(error)
-    return describe_error(error)
-
-
-def run_game(
-    connection: Connection,
-    find: Callable[[], Model],
-    options: dict[str, Any],
-) -> None:
-    """Play in this process, which the server has started, until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends this process
-    try:
-        game = Game(find(), **options)
-    except Exception as error:
-        connection.send((None, {"type": "failed", "text": _message_of(error)}))
-        return
-    with suppress(ConnectionError):
-        game.serve(connection)
+def line_of(row: Row) -> Message:
+    """Return the line of a decision in a recording."""
+    return {key: value for key, value in row.items() if key in RECORDED}

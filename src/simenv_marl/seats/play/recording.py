@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
 
@@ -16,27 +17,97 @@ from ...errors import (
 )
 from ...simulation import Action, Model, Observation
 from ..recordings import digest_of
-from .forms import Message, action_of
+from .forms import Message, action_of, jsonable
 
-Episode = tuple[int, list[Message]]
-"""The seed of an episode, and the lines of its decisions."""
+
+@dataclass
+class Episode:
+    """A recorded episode.
+
+    Attributes:
+        header: Its first line, with the simulation, the seed, the seats and the options.
+        decisions: The lines of its decisions, without those that later ones have replaced.
+        turn: Where the game stands: the number of decisions before the pending one.
+    """
+
+    header: Message
+    decisions: list[Message] = field(default_factory=list)
+    turn: int = 0
+
+    def add(self, line: Message) -> None:
+        """Add a line: a decision, or a move to another turn.
+
+        Raises:
+            ValueError: The line before it is missing.
+        """
+        if not 0 <= line["turn"] <= len(self.decisions):
+            raise ValueError(f"the decision before turn {line['turn']} is missing")
+        self.turn = line["turn"]
+        if "agent" in line:
+            self.decisions[self.turn :] = [line]
+            self.turn += 1
+
+
+class Recorder:
+    """Appends lines to a recording, which is closed in between: clones need not copy it.
+
+    Lines that could not be written are written with the next one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Use the file of a path, which need not exist."""
+        self.path = path
+        self._unsaved = ""
+        self._may_be_torn = True
+
+    def add(self, line: Message) -> str:
+        """Append a line; return the problem, or ""."""
+        self._unsaved += json.dumps(jsonable(line), allow_nan=False) + "\n"
+        try:
+            start = self._start()
+            self._may_be_torn = True
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(start + self._unsaved)
+        except OSError as error:
+            return f"The recording {self.path} cannot be written: {error}"
+        self._may_be_torn = False
+        self._unsaved = ""
+        return ""
+
+    def _start(self) -> str:
+        """Return the end of a line that a crash or a full disk has torn."""
+        if not self._may_be_torn or not self.path.exists():
+            return ""
+        last = self.path.read_bytes()[-1:]
+        return "" if last in (b"", b"\n") else "\n"
 
 
 def read(path: str | os.PathLike[str]) -> list[Episode]:
-    """Read the episodes of a recording: seeds and decisions.
+    """Read the episodes of a recording.
 
-    A decision replaces the earlier ones from its turn on, which were undone.
+    A decision replaces the earlier ones from its turn on, which were undone. A line that a crash
+    has torn is left out.
+
+    Raises:
+        StoreError: The file cannot be read, or the lines do not fit together.
     """
     episodes: list[Episode] = []
     try:
-        for text in Path(path).read_text(encoding="utf-8").splitlines():
-            line = json.loads(text)
+        content = Path(path).read_bytes()
+        for text in content.splitlines():
+            try:
+                line = json.loads(text)
+            except ValueError:
+                continue
             if "seed" in line:
-                episodes.append((line["seed"], []))
+                episodes.append(Episode(line))
+            elif line.get("back"):
+                episodes.pop()  # the game before the restart goes on
             else:
-                _, decisions = episodes[-1]
-                decisions[line["turn"] :] = [line]
-    except (OSError, ValueError, TypeError, LookupError) as error:
+                episodes[-1].add(line)
+        if content and not episodes:
+            raise ValueError("it has no episode")
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise StoreError(f"the recording {path} cannot be read: {error!r}") from error
     return episodes
 
@@ -57,23 +128,24 @@ def replay(
         points: As ``aec_env`` takes them.
         episode: The index of the episode in the file. It is truncated after its last recorded
             decision.
-        **options: The options of ``aec_env``, as they were in the recorded episode: the page sets
-            none.
+        **options: The options of ``aec_env``, as they were in the recorded episode. The file has
+            ``skip_forced``.
 
     Returns:
         A dict from the name of each agent to its ``Trajectories``, which ``save_dataset`` writes.
-        Decisions of people have ``by_rule`` False.
+        Decisions of people and policies have ``by_rule`` False.
 
     Raises:
         StoreError: The file cannot be read.
         OptionValueError: There is no such episode, or the simulation does not repeat it.
     """
     episodes = read(path)
-    if not -len(episodes) <= episode < len(episodes) or not episodes[episode][1]:
+    if not -len(episodes) <= episode < len(episodes) or not episodes[episode].decisions:
         raise OptionValueError(
             f"nothing was decided in episode {episode} of the {len(episodes)} of {path}"
         )
-    seed, decisions = episodes[episode]
+    header = episodes[episode].header
+    decisions = episodes[episode].decisions
     lines = iter(decisions)
     problem = f"{short_repr(simulation)} does not repeat {path}"
 
@@ -87,12 +159,14 @@ def replay(
             )
         return action_of(_decision.action_space, line["action"])
 
+    if header.get("skip_forced"):
+        options.setdefault("skip_forced", True)
     options["max_steps"] = len(decisions)
     try:
         trajectories = collect_episodes(
             simulation,
             {line["agent"]: answer for line in decisions},
-            seeds=[seed],
+            seeds=[header["seed"]],
             points=points,
             **options,
         )

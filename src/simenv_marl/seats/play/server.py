@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from ipaddress import ip_address
 from itertools import count
+from math import isfinite
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,10 +26,11 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Lifespan, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from ...errors import OptionValueError, ProcessDiedError
-from ...simulation import Model
+from ...core import pack_plainly
+from ...errors import OptionValueError, ProcessDiedError, SimEnvError, StoreError
 from .forms import Message
-from .game import run_game
+from .game import Game
+from .host import Rules, run_game
 
 MOST_PAGES: Final = 64
 """The largest number of open pages. One more closes the page of the oldest spectator."""
@@ -48,8 +50,17 @@ MOST_WAITING: Final = 4
 INVALID: Final = "the message is not one of this page"
 """The answer to an invalid message."""
 
-FILES: Final = ("/page.js", "/page.css")
+STRANGER: Final = "the link of this page has no key of this game: ask for the link of your seat"
+"""The answer to a message without a key."""
+
+MOVES: Final = ("act", "rule", "undo", "redo", "jump", "restart", "again")
+"""The messages after which the simulation may compute."""
+
+FILES: Final = ("/page.js", "/view.js", "/inputs.js", "/charts.js", "/link.js", "/page.css")
 """The files of the page."""
+
+PATHS: Final = ("/", "/watch", "/facilitator", "/seat/{seat:path}")
+"""The paths of the page, which shows a lobby, a seat, or the game alone."""
 
 HEADERS: Final = {
     "Content-Security-Policy": (
@@ -75,7 +86,8 @@ class Link:
         self._ready = asyncio.Event()
 
     def send(self, kind: str, text: str) -> None:
-        """Send a message soon."""
+        """Send a message soon, after all that wait."""
+        self._outbox.pop(kind, None)
         self._outbox[kind] = text
         self._ready.set()
 
@@ -90,6 +102,43 @@ class Link:
                     await self.websocket.send_text(text)
 
 
+class Keys:
+    """The keys in the links of a game, which are the same when a recording is resumed.
+
+    Attributes:
+        seats: The seat of each key; "" for the facilitator.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        """Use a file, which need not exist; None: there is none.
+
+        Raises:
+            StoreError: The file cannot be read.
+        """
+        self.seats: dict[str, str] = {}
+        self._path = path
+        if path is not None and path.exists():
+            try:
+                self.seats = dict(json.loads(path.read_text(encoding="utf-8")))
+            except (OSError, ValueError, TypeError) as error:
+                raise StoreError(f"the keys {path} cannot be read: {error!r}") from error
+
+    def link(self, seat: str) -> str:
+        """Return the path of a seat's page, with its key."""
+        keys = {seat: key for key, seat in self.seats.items()}
+        if seat not in keys:
+            keys[seat] = secrets.token_hex(16)
+            self.seats[keys[seat]] = seat
+            self._save()
+        name = f"seat/{quote(seat, safe='', errors='replace')}" if seat else "facilitator"
+        return f"/{name}?key={keys[seat]}"
+
+    def _save(self) -> None:
+        if self._path is not None:
+            self._path.touch(mode=0o600)
+            self._path.write_text(json.dumps(self.seats), encoding="utf-8")
+
+
 class Table:
     """The links to all pages, around the connection to the game."""
 
@@ -98,6 +147,9 @@ class Table:
         connection: Connection,
         state: Message,
         announce: Callable[[str], None],
+        keys: Keys | None = None,
+        *,
+        is_open: bool = True,
     ) -> None:
         """Take over the game's connection.
 
@@ -105,12 +157,17 @@ class Table:
             connection: The connection to the game.
             state: The first state of the game.
             announce: A function that is called with the path of each seat.
+            keys: The keys of the seats.
+            is_open: Whether the lobby gives free seats to all who ask.
         """
         self.links: dict[int, Link] = {}
         self.latest: dict[str, str] = {}  # the latest message of each type, for newcomers
         self._connection = connection
         self._announce = announce
-        self._keys: dict[str, str] = {}  # of the seats
+        self._is_open = is_open
+        self._keys = keys or Keys(None)
+        self._announced: set[str] = set()
+        self._opened: dict[str, None] = {}  # the seats whose pages were open at any time
         self._seats: dict[int, str] = {}  # of the links; spectators have none
         self._waiting: Counter[int] = Counter()  # messages of each link that wait for the game
         self._numbers = count(1)
@@ -136,7 +193,7 @@ class Table:
             while (message := await websocket.receive())["type"] == "websocket.receive":
                 problem = self._pass_on(number, message.get("text") or "")
                 if problem:
-                    link.send("error", json.dumps({"type": "error", "text": problem}))
+                    link.send("error", json.dumps({"type": "error"} | problem))
                 await asyncio.sleep(PAUSE)
         except RuntimeError:  # this server has closed the page
             pass
@@ -146,47 +203,74 @@ class Table:
             self._seats.pop(number, None)
             self._tell_people()
 
-    def _pass_on(self, number: int, text: str) -> str:
-        """Check a message, and pass it on to the game; return the problem, or ""."""
+    def _pass_on(self, number: int, text: str) -> Message:
+        """Check a message, and pass it on to the game; return the problem."""
         try:
-            match json.loads(text, parse_constant=str):
-                case {"seat": str(seat), "key": str(key), **message}:
-                    parcel = pickle.dumps((number, seat, message))  # it may be too deep
+            match json.loads(text, parse_constant=str, parse_float=_finite):
+                case {"do": "claim", "seat": str(seat)}:
+                    return self._claim(number, seat)
+                case {"key": str(key), **message}:
+                    owner = self._keys.seats.get(key)
+                    parcel = pickle.dumps((number, owner, message))  # it may be too deep
                 case _:
-                    return INVALID
+                    return {"text": INVALID}
         except (ValueError, RecursionError):
-            return INVALID
-        expected = self._keys.get(seat, "").encode()
-        sent = key.encode(errors="replace")
-        if not expected or not secrets.compare_digest(expected, sent):
-            return "the link of this page has no key of this game: ask for the link of your seat"
+            return {"text": INVALID}
+        if owner is None or message.get("seat", owner) != owner:
+            return {"text": STRANGER, "stranger": True}
         if message.get("do") == "take":
-            self._seats[number] = seat
+            if owner:
+                self._seats[number] = owner
+                self._opened[owner] = None
+            self.links[number].send("you", json.dumps({"type": "you", "seat": owner}))
             self._tell_people()
         elif self._waiting[number] >= MOST_WAITING:
-            return "the game is busy; try again"
+            return {"text": "the game is busy; try again"}
         else:
             self._waiting[number] += 1
             self._inbox.put_nowait(parcel)
-        return ""
+            if message.get("do") in MOVES:
+                self._send_all({"type": "busy", "on": True})
+        return {}
+
+    def _claim(self, number: int, seat: str) -> Message:
+        """Give a free seat to a page of the lobby; return the problem."""
+        if seat not in self._announced:
+            return {"text": INVALID}
+        if not self._is_open or seat in self._seats.values():
+            return {"text": f"{seat} needs the link of this seat: ask for it"}
+        link = {"type": "link", "path": self._keys.link(seat)}
+        self.links[number].send("link", json.dumps(link))
+        return {}
 
     def _tell_people(self) -> None:
         """Tell pages and game which seats people have."""
         people = Counter(self._seats.values())
         spectators = len(self.links) - people.total()
-        self._send_all({"type": "people", "spectators": spectators, "taken": people})
+        self._send_all(
+            {
+                "type": "people",
+                "spectators": spectators,
+                "taken": people,
+                "opened": list(self._opened),
+                "open": self._is_open,
+            }
+        )
         self._inbox.put_nowait(pickle.dumps((None, None, {"taken": people})))
 
     def _show(self, message: Message) -> None:
-        for seat in message.get("seats", ()):
-            if seat not in self._keys:
-                self._keys[seat] = secrets.token_hex(16)
-                self._announce(f"/seat/{quote(seat, safe='')}?key={self._keys[seat]}")
+        if message["type"] == "state":
+            self.latest.pop("busy", None)
+            seats = ["", *message["seats"]] if message.get("tools") == "facilitator" else ()
+            for seat in seats or message.get("seats", ()):
+                if seat not in self._announced:
+                    self._announced.add(seat)
+                    self._announce(self._keys.link(seat))
         self._send_all(message)
 
     def _send_all(self, message: Message) -> None:
         kind = message["type"]
-        text = self.latest[kind] = json.dumps(message)
+        text = self.latest[kind] = json.dumps(message, allow_nan=False)
         for link in self.links.values():
             link.send(kind, text)
 
@@ -201,8 +285,10 @@ class Table:
                 if message is not None:
                     if number is None:
                         self._show(message)
-                    elif link is not None:
-                        link.send("error", json.dumps(message))
+                    else:
+                        self._send_all({"type": "busy", "on": False})
+                        if link is not None:
+                            link.send("error", json.dumps(message))
 
     async def write_game(self) -> None:
         """Pass messages on to the game."""
@@ -210,6 +296,12 @@ class Table:
             while True:
                 parcel = await self._inbox.get()
                 await asyncio.to_thread(self._connection.send_bytes, parcel)
+
+
+def _finite(text: str) -> float | str:
+    """Return a number of JSON; if it is too large, its text."""
+    number = float(text)
+    return number if isfinite(number) else text
 
 
 class _Server(uvicorn.Server):
@@ -227,11 +319,11 @@ def make_app(
 
     async def page(request: Request) -> FileResponse:
         path = request.url.path
-        if path not in FILES:
+        if path not in FILES:  # the page itself
             path = "/page.html"
         return FileResponse(Path(__file__).with_name(path[1:]), headers=HEADERS)
 
-    routes: list[BaseRoute] = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
+    routes: list[BaseRoute] = [Route(path, page) for path in (*PATHS, *FILES)]
     routes.append(WebSocketRoute("/ws", table.serve))
     app = Starlette(routes=routes, lifespan=lifespan)
     names = {"localhost", host.lower(), socket.gethostname().lower()}
@@ -267,26 +359,24 @@ def _is_own(netloc: str, names: set[str]) -> bool:
         return False
 
 
-def play(
-    find: Callable[[], Model],
+def serve(
+    make: Callable[[], tuple[Game, Rules]],
     *,
-    seed: int | None,
     host: str,
     port: int,
-    **options: object,
+    record: Path | None,
 ) -> str:
-    """Play until an interrupt; return a summary.
+    """Serve a game until an interrupt; return a summary.
 
     Args:
-        find: A callable that returns the simulation. It is pickled, and called in the process that
-            plays.
-        seed: The seed of the first episode; None: a random one.
+        make: A function that makes the game. It is called in the process that plays.
         host: The address to listen on.
         port: The port; 0: any free one.
-        **options: The other options of ``Game``.
+        record: The file of the recording, beside which the keys are kept.
 
     Raises:
         OptionValueError: An option has an invalid value, or the simulation cannot be played.
+        StoreError: The keys cannot be read.
         ProcessDiedError: The process that plays has ended.
     """
     if not 0 <= port < 65_536:
@@ -294,10 +384,9 @@ def play(
     # A spawned process inherits neither threads nor sockets, which clones would copy.
     context = get_context("spawn")
     connection, game_connection = context.Pipe()
-    options["seed"] = secrets.randbelow(2**31) if seed is None else seed
     process = context.Process(
         target=run_game,
-        args=(game_connection, find, options),
+        args=(game_connection, pack_plainly(make)),
     )
     process.start()
     game_connection.close()
@@ -314,14 +403,19 @@ def play(
         _, state = connection.recv()
         if state["type"] == "failed":
             raise OptionValueError(state["text"])
+        keys = Keys(None if record is None else record.with_name(f"{record.name}.keys"))
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.create_server((host, port), family=family) as listener:
             base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
-            print(f"Watch the game at {base}/ or play at the link of a seat:", flush=True)
+            if state["length"]:
+                print(f"The game of {record} goes on.", flush=True)
+            print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
             table = Table(
                 connection,
                 state,
                 lambda path: print(f"  {base}{path}", flush=True),
+                keys,
+                is_open=_is_loopback(host),
             )
             _run(table, host, listener, end_game)
     except EOFError:
@@ -330,11 +424,20 @@ def play(
             f"the process of the game has ended, with exit code {process.exitcode}"
         ) from None
     except OSError as error:
+        if isinstance(error, SimEnvError):
+            raise
         raise OptionValueError(f"cannot listen on {host}, port {port}: {error}") from error
     finally:
         end_game()
     returns = json.loads(table.latest["state"])["returns"]
     return "The returns: " + ", ".join(f"{agent} {total:g}" for agent, total in returns.items())
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
 
 
 def _shown_host(host: str) -> str:

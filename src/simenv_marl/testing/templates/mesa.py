@@ -100,6 +100,16 @@ move = make_step(
     reward_mapping=difference(lambda rabbit: rabbit.eaten),  # since its last decision
     agent=lambda rabbit: f"rabbit_{rabbit.unique_id}",  # from its birth ...
     removed_by="mesa.agent.Agent.remove",  # ... to its death
+    # For people and language models:
+    question="Where does the rabbit go?",
+    action_labels=lambda rabbit: [
+        f"{place.coordinate}: grass {rabbit.model.grass[place.coordinate]:.2f}"
+        for place in rabbit.places()
+    ],
+    display_mapping=lambda rabbit: {
+        "energy": f"{rabbit.energy:.2f}",
+        "grass here": f"{rabbit.model.grass[rabbit.cell.coordinate]:.2f}",
+    },
 )
 
 # -- 3. The simulation: an episode ----------------------------------------------------------------

@@ -85,6 +85,17 @@ flow = make_step(
     apply=lambda action, model: (model.sun - model.use, 0.0, model.power)[action],
     reward_mapping=difference(lambda model: -model.cost),  # since the last decision
     agent="battery_0",
+    # For people and language models:
+    question="What does the battery do in this hour?",
+    action_labels=["store the surplus, cover the lack", "nothing", "take as much as it can"],
+    observation_labels=["time of day (sine)", "(cosine)", "charge", "sun", "use", "price"],
+    display_mapping=lambda model: {
+        "hour": f"{model.hour % 24}:00",
+        "charge": f"{model.charge:.1f} of {model.capacity:g} kWh",
+        "sun": f"{model.sun:.1f} kWh",
+        "use of the house": f"{model.use:.1f} kWh",
+        "price": f"{model.price:.2f} for a kWh",
+    },
 )
 
 # -- 3. The simulation: an episode ----------------------------------------------------------------

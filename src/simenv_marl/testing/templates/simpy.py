@@ -87,6 +87,17 @@ dispatch = make_step(
     choices=lambda shop: shop.waiting[:8],  # the action is an index
     reward_mapping=difference(lambda shop: -shop.late / 60),  # since the last decision
     agent="dispatcher_0",
+    # For people and language models:
+    question="Which job is painted next?",
+    action_labels=lambda shop: {
+        action: f"{job.minutes:g} minutes, due in {job.due - shop.clock.now:.0f}"
+        for action, job in enumerate(shop.waiting[:8])
+    },
+    display_mapping=lambda shop: {
+        "minutes since the morning": f"{shop.clock.now:.0f}",
+        "waiting jobs": len(shop.waiting),
+        "minutes too late so far": f"{shop.late:.0f}",
+    },
 )
 
 # -- 3. The simulation: an episode ----------------------------------------------------------------

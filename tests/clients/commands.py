@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def python(*arguments: object, **environment: str) -> str:
+def python(*arguments, **environment):
     """Run another Python with additional environment variables, and return its output."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))  # the models of the
 torch = pytest.importorskip("torch")
 
 
-def pytest_configure(config) -> None:
+def pytest_configure(config):
     """Allow the learners' warnings; this library's, and lost exceptions, are errors."""
     for line in (
         "default",

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from types import CodeType
-from typing import Any
 
 from tests.worlds.undone import models_of_pages_forgotten
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def blocks(name: str, section: str | None = None) -> list[CodeType]:
+def blocks(name, section=None):
     """Compile all python blocks of a file in ``docs``, or of its section or tab, in order."""
     text = (DOCS / name).read_text(encoding="utf-8")
     tab = f"{{tab-item}} {section}\n"
@@ -31,10 +28,10 @@ def blocks(name: str, section: str | None = None) -> list[CodeType]:
     ]
 
 
-def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
+def steps(section, monkeypatch):
     """Run the python blocks of a section of ``docs/clients.md``, and yield the names after each."""
     monkeypatch.syspath_prepend(DOCS)
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names = {"__name__": "__main__"}
     with models_of_pages_forgotten():
         for code in blocks("clients.md", section):
             exec(code, names)

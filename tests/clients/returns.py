@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
-
 import numpy as np
 
 from simenv_marl import parallel_env
 
 
 def mean_return(
-    simulation: Any,
-    points: Any,
-    act: Callable[[str, Any, dict[str, Any]], Any],
+    simulation,
+    points,
+    act,
     *,
-    seeds: Iterable[int] = range(10_000, 10_030),
-    **options: Any,
-) -> float:
+    seeds=range(10_000, 10_030),
+    **options,
+):
     """The mean sum of all agents' returns; ``act`` decides by agent, observation and info."""
     env = parallel_env(simulation, points, **options)
     returns = []

@@ -21,12 +21,12 @@ class Clinic:
     five needs.
     """
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.random = np.random.default_rng(seed)
         self.right = 0
         self.need = 0
 
-    def run(self) -> None:
+    def run(self):
         events = [(self.random.exponential(20), patient, 0) for patient in range(PATIENTS)]
         heapq.heapify(events)
         while events:
@@ -37,13 +37,13 @@ class Clinic:
             if stage < 2:
                 heapq.heappush(events, (time + self.random.exponential(5), patient, stage + 1))
 
-    def triage(self) -> int:
+    def triage(self):
         return min(self.need, NEEDS - 2)
 
-    def treat(self) -> int:
+    def treat(self):
         return min(self.need, NEEDS - 2)
 
-    def analyse(self) -> int:
+    def analyse(self):
         return min(self.need, NEEDS - 2)
 
 

@@ -226,7 +226,7 @@ def test_there_may_be_no_legal_action_between_decisions(make, legal):
     HAND.clear()
 
 
-HAND: list[str] = []
+HAND = []
 
 # -- births and deaths ----------------------------------------------------------------------------
 

@@ -14,24 +14,24 @@ from tests.worlds.models import calling, decision, define, play, script
 class Nurse:
     """Decides by two functions."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         self.name = name
 
-    def walk(self) -> int:
+    def walk(self):
         return 0
 
-    def treat(self) -> int:
+    def treat(self):
         return 0
 
 
 class Ward:
     """Nurses that walk and treat in turns. Nurses leave."""
 
-    def reset(self, seed: int | None = None) -> None:
-        self.log: list[tuple[str, str, int]] = []
+    def reset(self, seed=None):
+        self.log = []
         self.nurses = [Nurse("ann"), Nurse("bob")]
 
-    def run(self) -> None:
+    def run(self):
         for day in range(3):
             for nurse in list(self.nurses):
                 self.log.append((nurse.name, "walk", nurse.walk()))
@@ -39,7 +39,7 @@ class Ward:
             if day == 1:
                 self.leave(self.nurses[0])
 
-    def leave(self, nurse: Nurse) -> None:
+    def leave(self, nurse):
         self.nurses.remove(nurse)
 
 
@@ -83,7 +83,7 @@ def test_an_entity_with_two_kinds_of_decisions_is_one_agent():
 class Announcing(Ward):
     """Announces both decisions of all nurses."""
 
-    def expected_calls(self, point: str) -> list[tuple[Nurse]]:
+    def expected_calls(self, point):
         return [(nurse,) for nurse in self.nurses]
 
 
@@ -190,16 +190,16 @@ def test_a_roster_is_an_upper_bound_where_agents_are_born():
 class Colony:
     """A second ant is born in one of four episodes."""
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.seed = seed
         self.has_two = np.random.default_rng(seed).random() < 0.25
-        self.log: list[int] = []
+        self.log = []
 
-    def run(self) -> None:
+    def run(self):
         for number in range(1 + self.has_two):
             self.log.append(self.decide(number))
 
-    def decide(self, number: int) -> int:
+    def decide(self, number):
         return 0
 
 

@@ -1,7 +1,5 @@
 """One reward for the team, in all views."""
 
-from typing import Any
-
 import pytest
 from hypothesis import given, settings
 
@@ -26,11 +24,11 @@ CLOSE = {"rel": 1e-9, "abs": 1e-6}
 class Counter:
     """A team's reward: the number of times that it was asked, and its values."""
 
-    def __init__(self, *values: float) -> None:
+    def __init__(self, *values):
         self.values = list(values)
         self.asked = 0
 
-    def __call__(self, simulation: Any) -> float:
+    def __call__(self, simulation):
         self.asked += 1
         return self.values[self.asked - 1] if self.values else 1.0
 
@@ -110,7 +108,7 @@ def test_a_reward_that_is_no_number_is_refused():
 # -- what adds up to what -------------------------------------------------------------------------
 
 
-def earned(yard: yards.Yard) -> float:
+def earned(yard):
     """What a yard has earned in all, with births and deaths."""
     return yard.fortune + 10.0 * yard.built
 
@@ -118,7 +116,7 @@ def earned(yard: yards.Yard) -> float:
 @given(yards.designs, yards.seeds)
 @settings(max_examples=60)
 def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
-    options: dict[str, Any] = {
+    options = {
         "possible_agents": yards.ROSTER,
         "team_reward": difference(earned),
     }
@@ -134,9 +132,9 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
         assert total == pytest.approx(earned(env.simulation) - before, **CLOSE)
         env.close()
     aec = aec_env(lambda: yards.Yard(design), yards.POINTS, **options)
-    begins: dict[str, float] = {}
-    totals: dict[str, float] = {}
-    ends: dict[str, float] = {}
+    begins = {}
+    totals = {}
+    ends = {}
     aec.reset(seed=seed)
     while aec.agents:
         agent = aec.agent_selection
@@ -169,7 +167,7 @@ def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, se
     now = earned(env.simulation)
     # The total when the round of each agent's first decision began.
     joined = {episode.pending.name: now}
-    totals: dict[str, float] = {}
+    totals = {}
     while env.agents:
         before = now
         _, rewards, terminations, truncations, infos = env.step(RULE)
@@ -207,7 +205,7 @@ def test_clones_go_on_with_the_teams_reward():
         env.close()
 
 
-def rest(env: Any) -> list[float]:
+def rest(env):
     """The rewards of the rest of an episode that follows the rule with 3."""
     rewards = []
     if hasattr(env, "agents"):

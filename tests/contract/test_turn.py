@@ -1,7 +1,6 @@
 """The turn view: one learner takes each decision as it arises."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ def one_hot(place, size):
 # -- equal to the AEC view ------------------------------------------------------------------------
 
 
-def compared(aec: Any, turn: Any, seed: int, action_of: Any) -> None:
+def compared(aec, turn, seed, action_of):
     """Both environments tell the same at each decision, and pay the same from step to step."""
     aec.reset(seed=seed)
     observation, info = turn.reset(seed=seed)
@@ -71,7 +70,7 @@ def compared(aec: Any, turn: Any, seed: int, action_of: Any) -> None:
 @given(yards.designs, yards.seeds)
 @settings(max_examples=60)
 def test_a_yard_of_births_and_deaths_is_that_of_the_aec_view(design, seed):
-    options: dict[str, Any] = {"possible_agents": yards.ROSTER}
+    options = {"possible_agents": yards.ROSTER}
     compared(
         aec_env(lambda: yards.Yard(design), yards.POINTS, **options),
         turn_env(lambda: yards.Yard(design), yards.POINTS, **options),
@@ -87,7 +86,7 @@ def test_any_world_is_that_of_the_aec_view(design, seed, answers):
     policies = {points[point]: worlds.advised for point in design.policies} | {
         points[point]: RULE for point in design.rules
     }
-    options: dict[str, Any] = {"policies": policies or None, "max_steps": design.max_steps}
+    options = {"policies": policies or None, "max_steps": design.max_steps}
     given_answers = iter(answers)
     compared(
         aec_env(lambda: worlds.World(design, points), points, **options),
@@ -315,15 +314,15 @@ def test_it_passes_the_check_of_gymnasium_and_stands_in_vectors(flatten):
 
 def test_states_stand_in_infos_on_request():
     class Counting:
-        def reset(self) -> None:
+        def reset(self):
             self.count = 0
 
-        def run(self) -> None:
+        def run(self):
             for _ in range(2):
                 self.count += 1
                 ant()
 
-        def state(self) -> list[int]:
+        def state(self):
             return [self.count]
 
     ant = decision(agent="ant_0")

@@ -1,7 +1,5 @@
 """Policies of learners that were trained in a turn or a joint view."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -30,25 +28,25 @@ SEEDS = range(4)
 class Bakery:
     """Two ovens and a shop decide in turns; chance decides how often."""
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.random = np.random.default_rng(seed)
-        self.trace: list[Any] = []
+        self.trace = []
         self.heat = 0.0
 
-    def run(self) -> None:
+    def run(self):
         for _ in range(6):
             for oven in range(2):
                 if self.random.random() < 0.7:
                     self.heat += self.bake(oven)
             self.heat -= self.sell()[0]
 
-    def bake(self, oven: int) -> int:
+    def bake(self, oven):
         return 0
 
-    def sell(self) -> list[float]:
+    def sell(self):
         return [0.0]
 
-    def log(self, agent: str, value: Any) -> Any:
+    def log(self, agent, value):
         self.trace.append((agent, value))
         return value
 
@@ -73,17 +71,17 @@ POINTS = {
 ROSTER = {Bakery.bake: ["oven_0", "oven_1"]}
 
 
-def predict(observation: Any, info: Any = None) -> Any:
+def predict(observation, info=None):
     """What a learner answers: it depends on all that it sees."""
     numbers = np.concatenate([np.ravel(part) for part in _parts(observation)])
     return np.sin(numbers.sum() + np.arange(4)).astype(np.float32)
 
 
-def _parts(observation: Any) -> list[Any]:
+def _parts(observation):
     return list(observation.values()) if isinstance(observation, dict) else [observation]
 
 
-def played(env: Any, answer: Any, seed: int) -> list[Any]:
+def played(env, answer, seed):
     """What a model comes to whose environment is stepped with a learner's answers."""
     observation, info = env.reset(seed=seed)
     ended = False
@@ -255,11 +253,11 @@ def test_the_teams_reward_counts_once_in_evaluations(tmp_path):
 class Pair(SimulationInterface):
     """Two animals decide in rounds. The first one dies."""
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed=None):
         self.ages = {"ant": 0, "bee": 0}
-        self.trace: list[int] = []
+        self.trace = []
 
-    def run(self) -> None:
+    def run(self):
         for day in range(6):
             for name in list(self.ages):
                 self.trace.append(self.act(name))
@@ -268,7 +266,7 @@ class Pair(SimulationInterface):
                 self.end_agent("ant")
                 del self.ages["ant"]
 
-    def act(self, name: str) -> int:
+    def act(self, name):
         return 0
 
 

@@ -22,7 +22,7 @@ from .episodes.episode import Episode
 from .episodes.session import Session
 from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
-from .plans.plan import Mode, Plan, Source, make_plan
+from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space
 from .plans.points import Points, portable
 from .plans.policies import (
@@ -88,7 +88,7 @@ __all__ = [  # noqa: RUF022 - by subject
     # Values.
     "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
     "common_observations", "duplicate", "explain_arguments", "joined",
-    "preferences", "same", "split_batch", "stacked", "stacker", "taken",
+    "preferences", "same", "source_name", "split_batch", "stacked", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",
     "is_seed", "preserve_generators", "reseed_generators",

@@ -77,8 +77,7 @@ def test_a_torn_last_line_costs_that_line(path):
     path.write_text(path.read_text()[:-9])
     assert asked_again() == 1
     assert len(path.read_text().splitlines()) == 6  # the torn one was ended
-    with pytest.warns(UserWarning, match=r"line 5 of .* is no JSON"):
-        assert asked_again() == 0
+    assert asked_again() == 0
     path.write_text('"no answer"\n')
     with pytest.warns(UserWarning, match=r"line 1 of .* is no answer"):
         assert asked_again() == 5

@@ -5,6 +5,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -25,28 +26,37 @@ _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 # -- files ----------------------------------------------------------------------------------------
 
 
-def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
-    """Yield the lines of a file that are JSON, with their numbers from 1.
+class Lines:
+    """A file with a line of JSON for each value. It is open only while it is read or written."""
 
-    A last line that a crash has left unfinished is left out, and ended, so that the next line is
-    whole. Other lines that are no JSON are left out with a warning.
-    """
-    content = path.read_bytes() if path.exists() else b""
-    whole = content.count(b"\n")
-    if not content.endswith(b"\n") and content:
-        append_line(path, b"")
-    for number, line in enumerate(content.splitlines(), 1):
-        try:
-            yield number, json.loads(line)
-        except ValueError:
-            if line and number <= whole:
-                warn_user(f"line {number} of {path} is no JSON, and is left out")
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Name the file. The first line creates it."""
+        self.path = Path(path)
+        self._may_be_torn = True
 
+    def read(self) -> Iterator[tuple[int, Any]]:
+        """Yield the numbers of the lines, from 1, and their values.
 
-def append_line(path: Path, line: bytes) -> None:
-    """Append a line to a file, in one call, so that processes can share the file."""
-    with open(path, "ab", buffering=0) as file:
-        file.write(line + b"\n")
+        Lines that a crash has torn are left out.
+        """
+        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
+            with suppress(ValueError):
+                yield number, json.loads(line)
+
+    def append(self, *values: Any) -> None:
+        """Append lines, in one call, so that processes can share the file.
+
+        They begin on a new line, also where a crash or a full disk has torn the last one.
+        """
+        lines = [json.dumps(value, ensure_ascii=False) for value in values]
+        text = "".join(f"{line}\n" for line in lines).encode()
+        if self._may_be_torn and self.path.exists():
+            is_whole = self.path.read_bytes()[-1:] in (b"", b"\n")
+            text = text if is_whole else b"\n" + text
+        self._may_be_torn = True
+        with open(self.path, "ab", buffering=0) as file:
+            file.write(text)
+        self._may_be_torn = False
 
 
 # -- answers --------------------------------------------------------------------------------------
@@ -122,6 +132,7 @@ class Recording:
             raise OptionValueError(
                 f"{self.path} cannot be written: {self.path.parent} is no folder"
             )
+        self._file = Lines(path)
         self._run = uuid4().hex[:12]
         self._lines: dict[tuple[int, str], list[_Line]] | None = None
 
@@ -158,7 +169,7 @@ class Recording:
         outcome = replace(outcome, action=action, extras=extras)
         parts = vars(question) | vars(outcome) | {"run": self._run}
         entry = {name: part for name, part in parts.items() if part not in ("", {})}
-        append_line(self.path, json.dumps(entry, ensure_ascii=False).encode())
+        self._file.append(entry)
         lines = self._lines_of(question)
         self._given(decision).add(len(lines))
         lines.append(_Line(question, outcome, self._run))
@@ -172,7 +183,7 @@ class Recording:
         """Return the lines of the agent and the seed of a decision."""
         if self._lines is None:
             self._lines = defaultdict(list)
-            for number, entry in read_lines(self.path):
+            for number, entry in self._file.read() if self.path.exists() else ():
                 try:
                     line = _line_of(entry)
                 except (TypeError, LookupError):

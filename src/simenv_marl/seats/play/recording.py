@@ -1,6 +1,5 @@
 """Recordings of the page, and the episodes that they describe."""
 
-import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,8 @@ from ...errors import (
     short_repr,
 )
 from ...simulation import Action, Model, Observation
-from ..recordings import digest_of
+from ..descriptions import JSON
+from ..recordings import Lines, digest_of
 from .forms import Message, action_of, jsonable
 
 
@@ -56,30 +56,18 @@ class Recorder:
 
     def __init__(self, path: Path) -> None:
         """Use the file of a path, which need not exist."""
-        self.path = path
-        self._unsaved = ""
-        self._may_be_torn = True
+        self._file = Lines(path)
+        self._unsaved: list[JSON] = []
 
     def add(self, line: Message) -> str:
         """Append a line; return the problem, or ""."""
-        self._unsaved += json.dumps(jsonable(line), allow_nan=False) + "\n"
+        self._unsaved.append(jsonable(line))
         try:
-            start = self._start()
-            self._may_be_torn = True
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(start + self._unsaved)
+            self._file.append(*self._unsaved)
         except OSError as error:
-            return f"The recording {self.path} cannot be written: {error}"
-        self._may_be_torn = False
-        self._unsaved = ""
+            return f"The recording {self._file.path} cannot be written: {error}"
+        self._unsaved = []
         return ""
-
-    def _start(self) -> str:
-        """Return the end of a line that a crash or a full disk has torn."""
-        if not self._may_be_torn or not self.path.exists():
-            return ""
-        last = self.path.read_bytes()[-1:]
-        return "" if last in (b"", b"\n") else "\n"
 
 
 def read(path: str | os.PathLike[str]) -> list[Episode]:
@@ -93,19 +81,14 @@ def read(path: str | os.PathLike[str]) -> list[Episode]:
     """
     episodes: list[Episode] = []
     try:
-        content = Path(path).read_bytes()
-        for text in content.splitlines():
-            try:
-                line = json.loads(text)
-            except ValueError:
-                continue
+        for _, line in Lines(path).read():
             if "seed" in line:
                 episodes.append(Episode(line))
             elif line.get("back"):
                 episodes.pop()  # the game before the restart goes on
             else:
                 episodes[-1].add(line)
-        if content and not episodes:
+        if not episodes and Path(path).stat().st_size:
             raise ValueError("it has no episode")
     except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise StoreError(f"the recording {path} cannot be read: {error!r}") from error

@@ -48,7 +48,7 @@ def test_a_language_model_decides_by_labels():
     assert requests[0]["temperature"] == 0.0
     assert requests[0]["key"] == "Bearer a key"
     system, question = requests[0]["messages"]
-    assert "Choose how much water flows in." in system["content"]
+    assert "Choose how much water flows in." in question["content"]
     assert "level: 5" in question["content"]
     schema = requests[0]["response_format"]["json_schema"]["schema"]
     assert schema["properties"]["action"] == {"type": "string", "enum": ["closed", "half", "open"]}

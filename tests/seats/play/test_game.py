@@ -517,7 +517,7 @@ def test_a_recording_is_resumed_where_it_stood(make_host, tmp_path):
         file.write('{"turn": 3, "agent": "bu')  # a crash
     again = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
     moments = {"moment": 0, "event": ""}
-    assert settle(again) | moments == before | moments
+    assert settle(again) | moments == before | moments | {"resumed": True}
     assert {row["by"] for row in before["history"]} == {"person", "policy"}
     play(again, [0])
     assert [line["words"] for line in read(path)[-1].decisions if line["by"] == "person"] == [
@@ -693,7 +693,7 @@ def test_a_game_that_is_over_is_resumed_at_its_end(make_host, tmp_path):
     over = play(make_host(record=path), [2] * 8)
     moments = {"moment": 0, "event": ""}
     again = make_host(seats=(), record=path)  # with the recorded seats
-    assert settle(again) | moments == over | moments
+    assert settle(again) | moments == over | moments | {"resumed": True}
     again.handle("buyer", {"do": "undo"})
     assert settle(again)["turn"] == 14
     assert settle(make_host(record=path))["turn"] == 14

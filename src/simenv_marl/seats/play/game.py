@@ -77,6 +77,7 @@ class Game:
         new: Whether to begin another episode instead.
         can_fork: Whether checkpoints can be made. Else the way back is a replay.
         checkpoints: The checkpoints, by turn.
+        resumed: Whether a recorded episode goes on.
         root: The environment that was made for the game.
         env: The environment at the pending decision: ``root`` or a clone.
         agents: The known agents, and the name of the policy that decides for each, or "".
@@ -115,6 +116,7 @@ class Game:
         recorded = []
         if self.record is not None and self.record.exists() and not self.new:
             recorded = read(self.record)
+        self.resumed = bool(recorded)
         if recorded and not self.seats:
             self.seats = recorded[-1].header.get("seats", ())
         roster = self.root.session.plan.roster

@@ -456,6 +456,7 @@ class Host:
             "tools": self.rules.tools,
             "simulation": game.name,
             "seed": game.seed,
+            "resumed": game.resumed,
             "seats": seats,
             "policies": {agent: name for agent, name in game.agents.items() if name},
             "turn": game.turn,

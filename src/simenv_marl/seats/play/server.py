@@ -407,7 +407,7 @@ def serve(
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.create_server((host, port), family=family) as listener:
             base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
-            if state["length"]:
+            if state["resumed"]:
                 print(f"The game of {record} goes on.", flush=True)
             print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
             table = Table(

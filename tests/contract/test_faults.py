@@ -269,7 +269,7 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
 
 def interrupt_anywhere(name):
     """Interrupt a run of a view at each call, one after the other."""
-    threads.SECONDS_TO_UNWIND, view = 0.05, globals()[name]
+    threads.SECONDS_TO_UNWIND, view = 0.05, getattr(simenv_marl, name)
 
     def whole_run(env):
         env.reset(seed=1)

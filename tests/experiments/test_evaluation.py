@@ -344,6 +344,7 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
 def test_a_variant_brings_its_own_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
+    assert "error" not in frame, set(frame["error"])
     # for the keeper a policy decides, which is no contender's
     assert set(frame["agent"]) == {"helper", "team"}
     expected = [

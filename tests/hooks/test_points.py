@@ -436,3 +436,12 @@ def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkey
     env.reset()
     with pytest.raises(RewardError, match="not finite"):
         env.step(1)
+
+
+def test_a_name_with_a_definition_means_the_function_at_its_place():
+    class Derived(Trader):
+        bid = define(agent="derived")(Trader.bid)
+
+    env = aec_env(calling(lambda: Trader().bid("wheat")), {BID: define(agent="base")})
+    assert log_of(env) == [9]
+    assert env.possible_agents == ["base"]

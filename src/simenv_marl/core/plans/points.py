@@ -37,6 +37,7 @@ from ...hooks.places import (
     all_classes,
     find_hook,
     hook_at,
+    is_elsewhere,
     raw_attribute,
     resolve,
 )
@@ -58,14 +59,18 @@ _NONE: Final[Definitions] = MappingProxyType({})
 # -- points by name or function -------------------------------------------------------------------
 
 
-def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
+def locate(key: Key, own: Definitions = _NONE, *, defined: bool = False) -> DecisionPoint:
     """Return the point of a dotted name or function, whether it has a definition or not.
 
-    ``own`` are the points of the simulation itself, some of which are in no module.
+    Args:
+        key: The name or the function.
+        own: The points of the simulation itself, some of which are in no module.
+        defined: Whether a definition comes with the name. Then it means the function at this place,
+            and not one that was decorated from there and is elsewhere, as in a derived class.
     """
     if isinstance(key, str):
         for points in ({point.name: point for point in own}, registered()):
-            if key in points:
+            if key in points and not (defined and is_elsewhere(points[key])):
                 return points[key]
     return point_for(find_hook(key))
 
@@ -77,7 +82,7 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
     if isinstance(points, Mapping):
         for key, definition in points.items():
             with suppress(UnknownPointError, PatchError):
-                own[locate(key)] = definition
+                own[locate(key, defined=definition is not None)] = definition
     return own
 
 
@@ -172,7 +177,7 @@ def find_point(
             f"the definition of {name_of(key)} must come from make_step, not"
             f" {short_repr(definition)}"
         )
-    point = locate(key, own)
+    point = locate(key, own, defined=definition is not None)
     if not isinstance(key, str):  # a name means the latest definition, a decision function its own
         definition = definition or made_with(key)
     definition = definition or own.get(point) or point.definition or _inherited(point)

@@ -90,7 +90,7 @@ dispatch = make_step(
     # For people and language models:
     question="Which job is painted next?",
     action_labels=lambda shop: {
-        action: f"{job.minutes:g} minutes, due in {job.due - shop.clock.now:.0f}"
+        action: f"job {action + 1}: {job.minutes:g} minutes, due in {job.due - shop.clock.now:.0f}"
         for action, job in enumerate(shop.waiting[:8])
     },
     display_mapping=lambda shop: {

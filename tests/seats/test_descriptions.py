@@ -62,7 +62,7 @@ def test_it_is_described_as_json():
     }
 
 
-def test_a_question_and_a_display_are_described_in_place_of_rule_and_observation():
+def test_question_and_display_take_the_place_of_rule_and_observation():
     env = env_of(replace(FILL, question="How much?", display_mapping=lambda tank: {"m": "5 of 9"}))
     assert describe(env).splitlines()[1:4] == ["How much?", "Observation:", "- m: 5 of 9"]
     found = describe(env, as_json=True)

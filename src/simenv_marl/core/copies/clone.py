@@ -175,12 +175,7 @@ def branch(
     if not is_seed(n):
         raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
     if seeds is not None:
-        is_listed = isinstance(seeds, (Sequence, np.ndarray))
-        if not (is_listed and len(seeds) == n and all(map(is_seed, seeds))):
-            raise OptionValueError(
-                f"seeds must be n = {n} non-negative integers, one for each branch, not"
-                f" {short_repr(seeds)}"
-            )
+        _check_seeds(seeds, n)
         view.session.check_reseed()
     if DEPTH.get() == DEEPEST:
         raise BranchError(
@@ -195,22 +190,7 @@ def branch(
         )
         results: list[Result] = view.call(branch_there)
         return results
-
-    def call(continuation: Any, number: int) -> Result:
-        """In a branch, draw the future chance anew if there are seeds, and call the function."""
-        token = DEPTH.set(DEPTH.get() + 1)
-        try:
-            twin = getattr(continuation, "unwrapped", continuation)
-            twin.begin_branch()
-            twin.session.move_to(Where.CLONE)
-            if seeds is not None:
-                seed = int(seeds[number])
-                seed_globals(seed, PROCESS)
-                twin.session.reseed(seed)
-            return function(continuation, number)
-        finally:
-            DEPTH.reset(token)
-
+    call = partial(_call_deeper, function, seeds)
     if not is_remote:  # otherwise, the wrappers are in this process
         separate = separator_of(view.session.episode, method)
         if separate is not None:
@@ -249,7 +229,37 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
     return view
 
 
+def _check_seeds(seeds: Sequence[int], n: int) -> None:
+    is_listed = isinstance(seeds, (Sequence, np.ndarray))
+    if not (is_listed and len(seeds) == n and all(map(is_seed, seeds))):
+        raise OptionValueError(
+            f"seeds must be n = {n} non-negative integers, one for each branch, not"
+            f" {short_repr(seeds)}"
+        )
+
+
 # -- branches: clones for one call ----------------------------------------------------------------
+
+
+def _call_deeper(
+    function: Callable[[Any, int], Result],
+    seeds: Sequence[int] | None,
+    continuation: Any,
+    number: int,
+) -> Result:
+    """In a branch, draw the future chance anew if there are seeds, and call a function."""
+    token = DEPTH.set(DEPTH.get() + 1)
+    try:
+        twin = getattr(continuation, "unwrapped", continuation)
+        twin.begin_branch()
+        twin.session.move_to(Where.CLONE)
+        if seeds is not None:
+            seed = int(seeds[number])
+            seed_globals(seed, PROCESS)
+            twin.session.reseed(seed)
+        return function(continuation, number)
+    finally:
+        DEPTH.reset(token)
 
 
 def _call_on_clone(
@@ -279,22 +289,11 @@ def _call_in_forks(
     running: dict[Connection, tuple[int, Fork, float]] = {}  # with the number and the deadline
     cores = len(os.sched_getaffinity(0))
     numbers = iter(range(n))
-
-    def call_and_pack(number: int) -> bytes:
-        """In a branch, call the function; return its result as bytes."""
-        separate()
-        result = function(number)
-        try:
-            return pack_checked(result)
-        except Exception as error:
-            raise BranchError(
-                f"it returned a value that cannot be pickled ({describe_error(error)})"
-            ) from error
-
     with ExitStack() as forks:  # an interrupt may end the end of one of them
         while len(results) < n:
             for number in islice(numbers, cores - len(running)):
-                fork = Fork.begin(None, partial(call_and_pack, number), time_limit)
+                first = partial(_call_and_pack, separate, function, number)
+                fork = Fork.begin(None, first, time_limit)
                 forks.callback(fork.end, "")
                 running[fork.connection] = number, fork, time.monotonic() + time_limit
             oldest, _, deadline = next(iter(running.values()))
@@ -311,6 +310,20 @@ def _call_in_forks(
                 number, fork, _ = running.pop(connection)
                 results[number] = _result_of(number, fork)
     return [results[number] for number in range(n)]
+
+
+def _call_and_pack(
+    separate: Callable[[], None], function: Callable[[int], object], number: int
+) -> bytes:
+    """In a branch, call a function; return its result as bytes."""
+    separate()
+    result = function(number)
+    try:
+        return pack_checked(result)
+    except Exception as error:
+        raise BranchError(
+            f"it returned a value that cannot be pickled ({describe_error(error)})"
+        ) from error
 
 
 def _result_of(number: int, fork: Fork) -> Any:

@@ -289,6 +289,7 @@ PARTS = {
         ),
         {"a": 2, "b": (0.25, np.array([1, 0], np.int8))},
     ),
+    "text": (spaces.Text(4, min_length=0), ""),
     "many": (spaces.MultiDiscrete([3, 4]), np.array([2, 3])),
 }
 

@@ -50,11 +50,11 @@ class Lines:
         """
         lines = [json.dumps(value, ensure_ascii=False) for value in values]
         text = "".join(f"{line}\n" for line in lines).encode()
-        if self._may_be_torn and self.path.exists():
-            is_whole = self.path.read_bytes()[-1:] in (b"", b"\n")
-            text = text if is_whole else b"\n" + text
-        self._may_be_torn = True
-        with open(self.path, "ab", buffering=0) as file:
+        may_be_torn, self._may_be_torn = self._may_be_torn, True  # until all is written
+        with open(self.path, "ab+", buffering=0) as file:
+            if may_be_torn and file.tell():
+                file.seek(-1, os.SEEK_END)
+                text = text if file.read(1) == b"\n" else b"\n" + text
             file.write(text)
         self._may_be_torn = False
 
@@ -149,15 +149,18 @@ class Recording:
         """
         lines = self._lines_of(question)
         given = self._given(decision)
-        unused = [line for place, line in enumerate(lines) if place not in given]
-        for line in unused:
+        others = []
+        for place, line in enumerate(lines):
+            if place in given:
+                continue
             asked = line.question
             is_same = asked.observation == question.observation
             if is_same and asked.legal in (None, question.legal):
                 self._check_policy(question, asked)
-                given.add(lines.index(line))
+                given.add(place)
                 return _decoded(line.outcome, decision.action_space)
-        others = [line.question for line in unused if line.run != self._run]
+            if line.run != self._run:
+                others.append(asked)
         if others:
             raise self._refusal(question, others)
         return None
@@ -167,9 +170,9 @@ class Recording:
         action = None if outcome.action is RULE else encode(decision.action_space, outcome.action)
         extras = {name: _encode_part(part) for name, part in outcome.extras.items()}
         outcome = replace(outcome, action=action, extras=extras)
-        parts = vars(question) | vars(outcome) | {"run": self._run}
-        entry = {name: part for name, part in parts.items() if part not in ("", {})}
-        self._file.append(entry)
+        entry = vars(question) | vars(outcome) | {"run": self._run}
+        empty = [name for name in ("policy", "extras", "why", "counts") if not entry[name]]
+        self._file.append({name: entry[name] for name in entry if name not in empty})
         lines = self._lines_of(question)
         self._given(decision).add(len(lines))
         lines.append(_Line(question, outcome, self._run))

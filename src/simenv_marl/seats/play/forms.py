@@ -19,7 +19,7 @@ from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action, Observation
 from ..answers import MISFITS, to_action
-from ..descriptions import JSON, labelled, legal_actions
+from ..descriptions import JSON, labelled, legal_actions, situation
 from ..recordings import digest_of
 
 Message = dict[str, Any]
@@ -106,10 +106,7 @@ def situation_of(decision: Decision) -> list[Message]:
 
     Each entry has its label, its text, and its number or None.
     """
-    if decision.display is None:
-        return entries_of(decision.observation, decision.observation_labels)
-    parts = islice(decision.display.items(), MOST_ENTRIES)
-    return [_entry(label, value) for label, value in parts]
+    return _entries(situation(decision))
 
 
 def entries_of(
@@ -117,8 +114,11 @@ def entries_of(
     labels: Labels = None,
 ) -> list[Message]:
     """Return the first entries of an observation."""
-    parts = _parts(labelled(observation, labels))
-    return [_entry(label, value) for label, value in islice(parts, MOST_ENTRIES)]
+    return _entries(labelled(observation, labels))
+
+
+def _entries(value: JSON) -> list[Message]:
+    return [_entry(label, part) for label, part in islice(_parts(value), MOST_ENTRIES)]
 
 
 def _parts(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
@@ -135,8 +135,6 @@ def _parts(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
 
 def _entry(label: str, value: object) -> Message:
     number: float | None = None
-    if isinstance(value, np.generic):
-        value = value.item()
     if isinstance(value, str):
         begin = NUMBER.match(value)
         number = float(begin[0]) if begin else None

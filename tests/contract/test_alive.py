@@ -388,3 +388,33 @@ def test_a_set_that_the_model_holds_is_read_as_it_stands():
     weak = weaken(held)
     held.add(2)
     assert restore(weak) is held
+
+
+@pytest.mark.parametrize("kind", [list, set, dict.fromkeys])
+def test_an_emptied_argument_keeps_the_last_observation(kind):
+    class Shop(SimulationInterface):
+        def reset(self, seed=None):
+            self.jobs = kind(["mill", "drill"])
+
+        def serve(self, jobs):
+            return 0
+
+        def run(self):
+            self.serve(self.jobs)
+            self.jobs.clear()
+
+    seen = []
+
+    def observe(shop, jobs):
+        seen.append(len(jobs))
+        return [len(jobs), 0.0]
+
+    paid = []
+    changes = {
+        "observation_space_mapping": observe,
+        "reward_mapping": lambda shop, jobs: float(paid.append(len(jobs)) or len(paid)),
+    }
+    env = begun(single_env(Shop, {Shop.serve: define(**changes)}), 1)
+    observation, reward, terminated, _, _ = env.step(0)
+    assert (observation.tolist(), reward, terminated) == ([2.0, 0.0], 2.0, True)
+    assert (seen, paid) == ([2], [2, 0])

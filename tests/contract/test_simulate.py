@@ -16,6 +16,8 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
+from tests.conftest import DRIVERS
+from tests.worlds.duels import LEFT, Duel, points
 from tests.worlds.many_worlds import (
     HERE,
     Answered,
@@ -187,3 +189,16 @@ def test_policies_keep_no_entity_alive(action):
     with pytest.raises(NoDecisionError, match="without a decision"):  # nobody else decides
         env.reset()
     assert env.simulation.log == [True] * 3
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_a_policy_gets_the_simulation_of_its_own_episode(driver):
+    asked = []
+
+    def policy(observation, *, _simulation):
+        asked.append(_simulation)
+        return 0
+
+    done = simulate(Duel, {LEFT: policy}, points=points(), seed=1, driver=driver)
+    assert asked
+    assert all(simulation is done for simulation in asked)

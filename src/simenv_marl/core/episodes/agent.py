@@ -478,18 +478,19 @@ class Agent:
             return
         args, kwargs = arguments.recall()
         gone = freed(args, kwargs)
-        if not gone:
+        unseen = gone | arguments.emptied(args, kwargs)
+        if not unseen:
             self.update(args, kwargs, reward=reward, asked=asked, last=last)
             return
         point = self.point
-        observes = not any(mapping.takes_any(gone) for mapping in point.takes_for_observation)
+        observes = not any(mapping.takes_any(unseen) for mapping in point.takes_for_observation)
         pays = not point.takes_for_reward.takes_any(gone)
         if not observes:
             self.clear_observation()
         self.reward = 0.0
         if reward and not pays and self.decided:
             self.fault = self.handler.warn_of_gone(gone, "the reward is 0.0")
-        elif not observes and self.decided:
+        elif gone and not observes and self.decided:
             self.handler.warn_of_gone(gone, "the last observation stays")
         if pays or observes:
             pays = reward and pays

@@ -26,6 +26,9 @@ _ATOMS: Final[frozenset[type]] = frozenset((bool, bytes, complex, float, int, st
 _KEPT: Final = (*_ATOMS, BuiltinFunctionType, FunctionType, MethodType, type)
 """Types of values that are kept: numbers, text, functions and classes."""
 
+_CONTAINERS: Final[frozenset[type]] = frozenset((deque, dict, list, set))
+"""Types of containers that a model may empty after a decision."""
+
 _LIBRARY: Final = __name__.partition(".")[0]
 
 GONE: Final = Sentinel("GONE")
@@ -53,11 +56,12 @@ class Arguments:
         is_empty: Whether no arguments are held.
     """
 
-    __slots__ = ("_args", "_kwargs", "_point", "first", "is_empty", "is_single")
+    __slots__ = ("_args", "_filled", "_kwargs", "_point", "first", "is_empty", "is_single")
 
     def __init__(self, point: Point) -> None:
         """Prepare to hold the arguments of decisions at a point."""
         self._point = point
+        self._filled: set[int | str] = set()  # the places of containers that were not empty
         self.first: Callable[[], Model] = _nothing
         self.is_single = False
         self.is_empty = True
@@ -74,6 +78,7 @@ class Arguments:
             self._kwargs = {
                 key: weaken(value) for key, value in kwargs.items() if keys is None or key in keys
             }
+        self._filled = _filled(args[: len(self._args)], kwargs)
         first = _nothing
         if args:
             held = self._args[0] if self._args else weaken(args[0])
@@ -93,6 +98,35 @@ class Arguments:
             return (GONE if entity is None else entity,), BOUND
         args = tuple(map(restore, self._args))
         return args, {key: restore(value) for key, value in self._kwargs.items()}
+
+    def emptied(self, args: Args, kwargs: Kwargs) -> set[int | str]:
+        """Return the numbers and the keywords of containers that the model has emptied since.
+
+        ``args`` and ``kwargs``: what ``recall`` has returned.
+        """
+        empty = self._filled - _filled(args, kwargs)
+        if empty:
+            held: dict[int | str, Model] = dict(enumerate(self._args))
+            held.update(self._kwargs)
+            empty = {key for key in empty if not _is_rebuilt(held.get(key))}
+        return empty
+
+
+def _filled(args: Args, kwargs: Kwargs) -> set[int | str]:
+    """Return the numbers and the keywords of the containers that are not empty."""
+    filled: set[int | str] = set()
+    for place, value in enumerate(args):
+        if type(value) in _CONTAINERS and value:
+            filled.add(place)
+    for key, value in kwargs.items():
+        if type(value) in _CONTAINERS and value:
+            filled.add(key)
+    return filled
+
+
+def _is_rebuilt(held: Model) -> bool:
+    """Return whether a held container is made anew from its living elements."""
+    return isinstance(held, _Held) and held.func is not _set
 
 
 def _nothing() -> None:

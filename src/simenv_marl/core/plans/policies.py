@@ -1,9 +1,10 @@
 """Policies: who answers a decision, and the arguments of a policy.
 
 A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it
-decides. A policy with ``_decision`` gets the pending ``Decision``, one with ``_state`` the state of
-the simulation. A coroutine function is awaited. All other policies get an observation, or an
-observation and an info.
+decides. A policy with ``_decision`` gets the pending ``Decision``, one with ``_simulation`` the
+simulation of its own environment, clone or branch, one with ``_state`` the state of the simulation.
+A coroutine function is awaited. All other policies get an observation, or an observation and an
+info.
 """
 
 from __future__ import annotations
@@ -57,6 +58,10 @@ class AskedEpisode(Protocol):
     def seed(self) -> int:
         """The seed of the episode."""
 
+    @property
+    def simulation(self) -> object:
+        """The simulation, for a policy that asks for it."""
+
     def planner_view(self) -> object:
         """Return the environment for a policy that asks for it."""
 
@@ -78,7 +83,7 @@ class AskedAgent(Protocol):
         """Add numbers to its counts."""
 
 
-ASKED: Final = ("_environment", "_decision", "_state")
+ASKED: Final = ("_environment", "_decision", "_simulation", "_state")
 """The keyword-only parameters of policies that ask for more. Batches have the last alone."""
 
 
@@ -334,13 +339,7 @@ class AskingPolicy(EpisodePolicy):
         if policy is RULE:
             return RULE
         call = self._call if policy is self.policy else Caller(policy)
-        asked: dict[str, object] = {}
-        if ASKED[0] in call.names:
-            asked[ASKED[0]] = episode.planner_view()
-        if ASKED[1] in call.names:
-            asked[ASKED[1]] = agent.describe(episode.seed, episode.where)
-        if ASKED[2] in call.names:
-            asked[ASKED[2]] = episode.read_state()
+        asked = {name: _look_up(name, episode, agent) for name in call.names}
         if not asked:  # a quick policy, as a rule
             return call(observation, info, asked)
         start = perf_counter()
@@ -351,3 +350,15 @@ class AskingPolicy(EpisodePolicy):
 
         answer = call(observation, info, asked)
         return when_answered(answer, conclude) if self.waits else conclude(answer)
+
+
+def _look_up(name: str, episode: AskedEpisode, agent: AskedAgent) -> object:
+    """Return what a policy asks for by a parameter of ``ASKED``."""
+    match name:
+        case "_environment":
+            return episode.planner_view()
+        case "_decision":
+            return agent.describe(episode.seed, episode.where)
+        case "_simulation":
+            return episode.simulation
+    return episode.read_state()

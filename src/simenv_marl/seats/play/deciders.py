@@ -38,6 +38,7 @@ class UserEpisode:
 
     def __init__(self, episode: Episode) -> None:
         self.seed = episode.seed
+        self.simulation = episode.simulation
         self.planner_view = episode.planner_view
         self.read_state = episode.read_state
 

@@ -458,8 +458,9 @@ def test_masked_candidates_are_left_out(wrapper):
     assert action_values(env, futures=2).actions == (0, 1)
     with pytest.raises(InvalidActionError, match="masked"):
         action_values(env, [1, 2])
-    told = RolloutPolicy([1, 2]).choose(env)  # one alone is not tried
-    assert (told.actions, told.best, told.counts.tolist()) == ((1,), 1, [0])
+    assert RolloutPolicy([1, 2], futures=2).choose(env).actions == (1, RULE)
+    told = RolloutPolicy([RULE]).choose(env)  # one alone is not tried
+    assert (told.actions, told.best, told.counts.tolist()) == ((RULE,), RULE, [0])
     assert np.isnan(told.means).all()
     for actions, match in (([2], "all candidates"), ([2, 5], "not in")):
         with pytest.raises(InvalidActionError, match=match):

@@ -184,7 +184,7 @@ def test_candidates_are_the_legal_actions_of_the_one_that_decides():
     for wrong, match in ((1, "mask"), (3, "has 3 of the 5"), (5, "is not in Discrete")):
         with pytest.raises(InvalidActionError, match=match):
             action_values(env, [0, wrong])
-    assert RolloutPolicy([0, 1, 3]).choose(env).actions == (0,)
+    assert RolloutPolicy([0, 1, 3]).choose(env).actions == (0, RULE)
     with pytest.raises(InvalidActionError, match="not in"):
         RolloutPolicy([0, 5]).choose(env)
     env.step(0)

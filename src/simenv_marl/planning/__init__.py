@@ -3,6 +3,7 @@
 Policies that decide by these values.
 """
 
+from .candidates import first
 from .rollouts import RolloutPolicy, action_values
 from .tree import TreeSearchPolicy
 from .values import ActionValues
@@ -12,4 +13,5 @@ __all__ = [
     "RolloutPolicy",
     "TreeSearchPolicy",
     "action_values",
+    "first",
 ]

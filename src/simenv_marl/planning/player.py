@@ -8,9 +8,12 @@ environment knows ``RULE``, so wrappers receive a legal sample in its place.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterable, Mapping
+from math import isfinite
+from numbers import Real
+from typing import Any, TypeAlias, TypeGuard
 
+import numpy as np
 from gymnasium import Env, spaces
 from pettingzoo import AECEnv, ParallelEnv
 
@@ -31,6 +34,7 @@ from ..core import (
     pending_view,
     policy_for,
     split_extras,
+    takes_info,
     two_arguments,
 )
 from ..data.deployed import JointPolicy
@@ -49,7 +53,8 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
-from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel
+from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel, asks_for
+from .candidates import Candidate, First, Propose, is_policy
 
 Environment: TypeAlias = (
     Env[Observation, Action]
@@ -57,6 +62,12 @@ Environment: TypeAlias = (
     | ParallelEnv[str, Observation, Action]
 )
 """An environment of one simulation, in any view, with or without wrappers."""
+
+Metric: TypeAlias = Callable[[Any], float]
+"""Returns how well a simulation stands. Larger is better."""
+
+Policies: TypeAlias = dict[str | Sentinel, Policy]
+"""Policies by agent, which are asked as those of a planner's branch."""
 
 
 class Player:
@@ -71,7 +82,11 @@ class Player:
         base: The policy after the candidate, or policies by agent.
         over: Whether the agent's episode has ended.
         latest: The observations and infos of the latest step, by agent. Empty before a step.
+        noted: The time of the first decision of another agent after a horizon, and what was
+            measured there. None: there was none.
     """
+
+    sees_rewards = True
 
     def __init__(
         self,
@@ -87,12 +102,21 @@ class Player:
         self.base = base
         self.over = False
         self.latest: dict[str, tuple[Observation, Info]] = {}
-        self._policies: dict[str | Sentinel, Policy] = {}
-        bases = base if isinstance(base, Mapping) else {self.name: base}
-        for each in bases:
-            policy = policy_for(bases, each, Where.PLAN)
-            self._policies[each] = policy if policy is RULE else two_arguments(policy)
-        self._everyone = self._policies.get(EVERYONE, RULE)
+        self.noted: tuple[float, float] | None = None
+        self._horizon: float | None = None
+        self._measure: Callable[[], float] = self.reward_so_far
+        self._bases = self._prepare(base)
+        self._known: dict[int, Policies] = {}
+
+    @property
+    def number(self) -> int:
+        """The number of its decisions that were answered."""
+        return self.agent.answered
+
+    def _prepare(self, policy: Policy) -> Policies:
+        """Prepare a policy, or policies by agent, to decide in a branch."""
+        policies = policy if isinstance(policy, Mapping) else {self.name: policy}
+        return {each: two_arguments(policy_for(policies, each, Where.PLAN)) for each in policies}
 
     # -- checks, before anything moves ------------------------------------------------------------
 
@@ -103,15 +127,18 @@ class Player:
 
     def candidates(
         self,
-        actions: Iterable[Action] | None,
+        actions: Iterable[Candidate] | Propose | None,
         *,
         legal: bool = False,
-    ) -> list[Action]:
+        incumbent: Candidate = None,
+    ) -> list[Candidate]:
         """Check the candidates for the pending decision.
 
         Args:
-            actions: A list of the candidates. None: all legal actions of a ``Discrete``.
+            actions: A list of the candidates, or a callable that proposes them. None: all legal
+                actions of a ``Discrete``.
             legal: Whether to leave out masked candidates. Otherwise they are refused.
+            incumbent: The latest choice of a planner, for the callable. None: there is none.
 
         Returns:
             The candidates.
@@ -121,6 +148,8 @@ class Player:
             InvalidActionError: A candidate is not legal, or all of them are masked.
         """
         space = self._space_of(self.name)
+        if callable(actions):
+            actions = self._propose(actions, incumbent)
         if actions is None and isinstance(space, spaces.Discrete):
             legal = True
             first = int(space.start)
@@ -132,7 +161,7 @@ class Player:
             )
         mask = self.mask
         for action in actions:
-            self._check(action, None if legal else mask)
+            self.check_candidate(action, None if legal else mask)
         candidates = [action for action in actions if not legal or self.allows(action)]
         if not candidates:
             raise InvalidActionError(
@@ -140,13 +169,34 @@ class Player:
             )
         return candidates
 
-    def allows(self, action: Action) -> bool:
-        """Return whether an action is legal now."""
+    def _propose(self, function: Propose, incumbent: Candidate) -> list[Candidate]:
+        """Ask a callable for candidates."""
+        observation, info = self._observe(self.name)
+        asked: dict[str, object] = {}
+        if asks_for(function, "_incumbent"):
+            asked["_incumbent"] = incumbent
+        if asks_for(function, "_decision"):
+            asked["_decision"] = self.agent.describe(self.episode.seed, self.episode.where)
+        seen = (observation, info) if takes_info(function) else (observation,)
+        return list(function(*seen, **asked))
+
+    def allows(self, candidate: Candidate) -> bool:
+        """Return whether a candidate is legal now."""
         try:
-            self._check(action, self.mask)
+            self.check_candidate(candidate, self.mask)
         except InvalidActionError:
             return False
         return True
+
+    def check_candidate(self, candidate: Candidate, mask: Mask | None) -> None:
+        """Refuse an illegal action, and a policy that cannot decide in branches."""
+        if isinstance(candidate, First):
+            _check_policy(candidate.then)
+            candidate = candidate.action
+        if is_policy(candidate):
+            _check_policy(candidate)
+        else:
+            self._check(candidate, mask)
 
     def _check(
         self,
@@ -156,8 +206,6 @@ class Player:
         """Refuse an illegal action. The mask counts unless wrappers have replaced the space."""
         point = self.agent.point
         space = self._space_of(self.name)
-        if action is RULE:
-            return
         if space == point.definition.action_space:
             point.validate(action, self.name, mask)
         elif action_check(space)(action) is ILLEGAL:
@@ -211,16 +259,30 @@ class Player:
 
     def decide(self) -> Action:
         """Return the agent's action by its base."""
-        return self._decide_for(self.name)
+        return self._decide_by(self._bases)
 
-    def replace_decision(self) -> None:
-        """Let a candidate take the place of the base's action, which a round includes, too."""
-        if isinstance(self._everyone, EpisodePolicy) and self._everyone.sees_all:
-            self.decide()
+    def answer(self, part: Candidate) -> Action:
+        """Return the action of a part of a candidate. The base answers for an illegal one."""
+        if part is not RULE and is_policy(part):
+            policies = self._known.get(id(part))
+            if policies is None:
+                policies = self._known[id(part)] = self._prepare(part)
+            return self._decide_by(policies)
+        if not self.allows(part):
+            return self.decide()
+        everyone = self._bases.get(EVERYONE)
+        if self.is_planned and isinstance(everyone, EpisodePolicy) and everyone.sees_all:
+            self.decide()  # the candidate takes the place of one action of its round
+        return part
 
-    def _decide_for(self, name: str) -> Action:
-        """Return an agent's action by its base."""
-        policy = self._policies.get(name, self._everyone)
+    def _decide_by(self, policies: Policies) -> Action:
+        """Return the agent's action by some policies."""
+        return self._decide_for(self.name, policies)
+
+    def _decide_for(self, name: str, policies: Policies | None = None) -> Action:
+        """Return an agent's action by some policies, or by the bases."""
+        policies = self._bases if policies is None else policies
+        policy = policies.get(name, policies.get(EVERYONE, RULE))
         if policy is RULE:
             return RULE
         observation, info = self._observe(name)
@@ -238,6 +300,54 @@ class Player:
             return self.latest[name]
         agent = self.episode.agents.get(name, self.agent)
         return agent.hand_out(), agent.info
+
+    # -- metrics and horizons ---------------------------------------------------------------------
+
+    def read(self, metric: Metric) -> float:
+        """Return the metric of the simulation."""
+        with self.episode.context():
+            return number_of(metric(self.episode.simulation), "metric")
+
+    def reward_so_far(self) -> float:
+        """Return the reward that the agent has earned by now, since its latest decision."""
+        return self.agent.reward_so_far()
+
+    def watch(self, horizon: float, metric: Metric | None) -> None:
+        """Note the metric, or the reward, at the first decision of another agent from a time on.
+
+        Rewards that wrappers change, and those of a team or a round, are not known there.
+        """
+        if metric is not None:
+            self._measure = lambda: self.read(metric)
+        elif not self.sees_rewards or self.env is not self.view or self.episode.team is not None:
+            return
+        self._horizon = horizon
+        self.episode.watch(self.note)
+
+    def note(self) -> None:
+        """Note the metric, or the reward, at the first decision after the horizon."""
+        if self._horizon is None or self.noted is not None:
+            return
+        now = self.time()
+        if now >= self._horizon:
+            self.noted = now, self._measure()
+
+    def can_run_out(self) -> bool:
+        """Return whether the rule can decide to the end, and nothing is observed."""
+        is_free = self.env is self.view and self.base is RULE
+        plan = self.episode.plan
+        return is_free and plan.options.max_steps is None and not plan.removers
+
+    def run_out(self) -> None:
+        """Let the rule decide to the end of the simulation. Observe nothing before that."""
+        episode = self.episode
+        while episode.pending is not None:
+            agents = episode.agents.values()
+            for agent in agents:
+                agent.delegate(RULE)
+            rules = {agent.name: RULE for agent in agents}
+            episode.step(RULE if episode.round is None else rules)
+        self.over = True
 
     # -- through wrappers -------------------------------------------------------------------------
 
@@ -320,6 +430,7 @@ class JointPlayer(Player):
     """The one agent of a joint view. Its action holds the actions of all agents of the roster."""
 
     view: SimulationJointEnv
+    sees_rewards = False
 
     def __init__(
         self,
@@ -330,15 +441,23 @@ class JointPlayer(Player):
         observation = self.view.joint.read(self.episode)[0]
         self.latest = {self.name: (observation, {})}
         space = self.view.action_space
-        policy = self._everyone
-        self._learner: JointPolicy | None = None
-        if isinstance(policy, JointPolicy) and policy.joint.action_space == space:
-            self._learner = policy
-        elif isinstance(base, Mapping) and not isinstance(space, spaces.Dict):
+        is_by_agent = isinstance(base, Mapping) and not self._learns(self._bases)
+        if is_by_agent and not isinstance(space, spaces.Dict):
             raise OptionValueError(
                 "a base by agent needs a joint view without flatten=True; pass one policy for all"
                 " agents"
             )
+
+    @property
+    def number(self) -> int:
+        """The number of rounds that were played."""
+        return self.episode.turns
+
+    def _learns(self, policies: Policies) -> TypeGuard[dict[Sentinel, JointPolicy]]:
+        """Return whether policies are those of a learner of this view."""
+        policy = policies.get(EVERYONE)
+        space = self.view.action_space
+        return isinstance(policy, JointPolicy) and policy.joint.action_space == space
 
     def _check(
         self,
@@ -347,21 +466,22 @@ class JointPlayer(Player):
     ) -> None:
         if self._space_of(self.name) == self.view.action_space:
             checked_actions(self.episode, self.view.joint.actions(self.episode.agents, action))
-        elif action is not RULE:
+        else:
             samples = self._samples(action, self.name)
             if samples:
                 action = {**action, **samples}
             super()._check(action, mask)
 
-    def decide(self) -> Action:
-        """Return the actions of all agents by the base."""
-        if self._learner is not None:
-            return self._learner.answer_all(self.episode, self.episode.pending or self.agent)
-        if not isinstance(self.base, Mapping):
-            return super().decide()
+    def _decide_by(self, policies: Policies) -> Action:
+        """Return the actions of all agents by some policies."""
+        if self._learns(policies):
+            pending = self.episode.pending or self.agent
+            return policies[EVERYONE].answer_all(self.episode, pending)
+        if self.name in policies:
+            return super()._decide_by(policies)
         agents = self.episode.agents
         return {
-            name: self._decide_for(name) if name in agents else RULE
+            name: self._decide_for(name, policies) if name in agents else RULE
             for name in self.view.joint.roster
         }
 
@@ -370,6 +490,7 @@ class TurnPlayer(Player):
     """The learner of a turn view, which decides for each agent. ``agent`` decides now."""
 
     view: SimulationTurnEnv
+    sees_rewards = False
 
     def __init__(
         self,
@@ -388,6 +509,11 @@ class TurnPlayer(Player):
             )
 
     @property
+    def number(self) -> int:
+        """The number of turns."""
+        return self.episode.turns
+
+    @property
     def mask(self) -> Mask | None:
         """The mask of the learner's actions. None: nothing can be masked."""
         return self.view.turn.mask(self.agent)
@@ -400,7 +526,7 @@ class TurnPlayer(Player):
         space = self._space_of(self.name)
         # Where masks do not count, an action of the largest ``Discrete`` may be another agent's.
         is_open = mask is None and not isinstance(space, spaces.Box)
-        if action is RULE or is_open or space != self.view.action_space:
+        if is_open or space != self.view.action_space:
             super()._check(action, mask)
         else:
             self.view.validate(action)
@@ -411,11 +537,11 @@ class TurnPlayer(Player):
         self.agent = self.view.own_agent
         return reward
 
-    def decide(self) -> Action:
-        """Return the learner's action by the base."""
-        if not isinstance(self.base, Mapping):
-            return super().decide()
-        action = self._decide_for(self.agent.name)
+    def _decide_by(self, policies: Policies) -> Action:
+        """Return the learner's action by some policies."""
+        if self.name in policies:
+            return super()._decide_by(policies)
+        action = self._decide_for(self.agent.name, policies)
         if action is not RULE:
             code = self.view.turn.seats[self.agent.point.hook].code
             action = code.encode(self.agent.validate(action))
@@ -451,6 +577,7 @@ class AECPlayer(Player):
             if ended:
                 self._step_env(None, name)
             else:
+                self.note()
                 self._step_env(self._decide_for(name), name)
         self.over = True
         return 0.0
@@ -463,15 +590,23 @@ class AECPlayer(Player):
 class ParallelPlayer(Player):
     """An agent of a parallel view. Its actions are parts of rounds."""
 
+    _total = 0.0
+
+    def reward_so_far(self) -> float:
+        """Return the agent's rewards of the rounds since its latest decision."""
+        return self._total
+
     def step(self, action: Action) -> float:
         """Play a round, and further ones without the agent until its decision is pending again."""
-        reward = self._play({self.name: action})
+        self._total = 0.0
+        self._play({self.name: action})
         while not self.over and self.episode.pending is not self.agent:
-            reward += self._play({})
-        return reward
+            self.note()
+            self._play({})
+        return self._total
 
-    def _play(self, actions: dict[str, Action]) -> float:
-        """Play a round. The other agents follow their bases. Return the agent's reward."""
+    def _play(self, actions: dict[str, Action]) -> None:
+        """Play a round. The other agents follow their bases. Add the agent's reward."""
         for name in self.episode.agents:
             if name != self.name:
                 actions[name] = self._decide_for(name)
@@ -480,7 +615,21 @@ class ParallelPlayer(Player):
         self.episode.memory.clear()  # policies for all agents answer each round anew
         over = terminations.get(self.name, True) or truncations[self.name]
         self.over = over or self.agent.ended  # pad_agents keeps ended agents
-        return float(rewards.get(self.name, 0.0))
+        self._total += float(rewards.get(self.name, 0.0))
+
+
+def number_of(value: Any, name: str) -> float:
+    """Return a finite number that a callable has returned. ``name``: its option."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if not is_number(value):
+        raise OptionValueError(f"{name} must return a finite number, not {short_repr(value)}")
+    return float(value)
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is one finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
 
 
 def player_of(

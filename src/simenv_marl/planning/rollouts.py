@@ -5,31 +5,24 @@ Policies that decide by these values.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
-from math import ceil, inf, isfinite, log2
-from numbers import Real
-from time import perf_counter
+from math import ceil, log2
 from typing import Any, ClassVar, Final, TypeAlias, TypeGuard
 from zlib import crc32
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core import (
-    Agent,
-    Info,
-    Policy,
-    branch,
-    checked_seed,
-    is_seed,
-)
-from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
+from ..core import Info, Policy, branch, checked_seed, is_seed, same
+from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
-from .player import Environment, Player, player_of
+from .candidates import Candidate, Choice, Course, First, Propose, is_policy
+from .player import Environment, Metric, Player, is_number, player_of
+from .rollout import Indices, Rollout, Try, try_out
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E
@@ -37,138 +30,6 @@ _KEY: Final = 0x706C616E
 
 _FRESH: Final = 8
 """The least number of fresh futures for the comparison of a candidate with the rule."""
-
-Indices = tuple[int, ...]
-"""The indices of the candidates at the agent's next decisions, beginning with the pending one."""
-
-Try = tuple[Indices, int]
-"""A rollout to make: its candidates, and the number of its future."""
-
-
-# -- rollouts, in branches ------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """A rollout at its end, or where it can be continued.
-
-    Attributes:
-        rewards: The discounted reward of each decision of the agent.
-        times: The simulation's times between the agent's decisions.
-        start: The simulation's time at its begin. None before that.
-        over: Whether the agent's episode has ended.
-        digest: A digest of the agent's last observation and info.
-        seconds: The mean real time for a step, in seconds.
-    """
-
-    rewards: Sequence[float] = ()
-    times: Sequence[float] = ()
-    start: float | None = None
-    over: bool = False
-    digest: int = 0
-    seconds: float = 0.0
-
-
-BEGIN: Final = Rollout()
-"""A rollout before its first decision."""
-
-
-def try_out(
-    env: Environment,
-    number: int,
-    tries: Sequence[Try],
-    actions: Sequence[Action],
-    policy: RolloutPolicy,
-    begun: Rollout = BEGIN,
-    stop: int | None = None,
-) -> Rollout:
-    """In a branch, make one of several rollouts.
-
-    The agent takes the actions, one at each decision, and then follows the base. If an action is
-    illegal when its decision arises, the base decides. The terminal value is added to the last
-    reward.
-
-    Args:
-        env: The environment of the branch.
-        number: The number of the rollout.
-        tries: The rollouts to make.
-        actions: The candidates.
-        policy: The planner.
-        begun: The rollout to continue.
-        stop: The index of the decision where it stops. None: it runs to its end.
-    """
-    indices, future = tries[number]
-    path = [actions[index] for index in indices]
-    began = perf_counter()
-    try:
-        player = player_of(env, policy.base)
-        player.start()
-        rewards = list(begun.rewards)
-        times = list(begun.times)
-        now = player.time()
-        start = now if begun.start is None else begun.start
-        horizon = policy.horizon or inf
-        while not player.over and len(rewards) != stop:
-            decision = len(rewards)
-            elapsed = {
-                "decision": decision,
-                "time": now - start,
-            }
-            weight = policy.discount ** elapsed[policy.discount_by]
-            if decision > 0 and elapsed[policy.horizon_by] >= horizon:
-                if policy.terminal_value is not None and stop is None:
-                    rewards[-1] += weight * _terminal_value(policy.terminal_value, env)
-                break
-            if decision == 0 or (decision < len(path) and player.allows(path[decision])):
-                action = path[decision]
-                player.replace_decision()
-            else:
-                action = player.decide()
-            rewards.append(weight * player.step(action))
-            if not player.over:
-                before = now
-                now = player.time()
-                times.append(now - before)
-    except BaseException as error:
-        tried = ", ".join(map(short_repr, path))
-        annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
-        raise
-    seconds = (perf_counter() - began) / max(1, len(rewards))
-    return Rollout(
-        rewards,
-        times,
-        start,
-        player.over,
-        _digest(player.agent),
-        seconds,
-    )
-
-
-def _terminal_value(
-    function: Callable[[Any], float],
-    env: Environment,
-) -> float:
-    value = function(env)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if not is_number(value):
-        raise OptionValueError(
-            f"terminal_value must return a finite number, not {short_repr(value)}"
-        )
-    return float(value)
-
-
-def _digest(agent: Agent) -> int:
-    last = (agent.observation, agent.info)
-    try:
-        return crc32(pickle.dumps(last, 5))  # much faster than a text
-    except Exception:
-        return crc32(repr(last).encode(errors="replace"))
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Return whether a value is one finite number."""
-    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
 
 
 def is_count(value: object) -> TypeGuard[int]:
@@ -195,6 +56,9 @@ CHECKS: Final[Checks] = {
     "futures": (is_count, "a positive integer"),
     "horizon_by": (_UNITS.__contains__, '"decision" or "time"'),
     "terminal_value": (callable, "a callable of the environment"),
+    "metric": (callable, "a callable of the simulation"),
+    "hold_by": (_UNITS.__contains__, '"decision" or "time"'),
+    "every": (is_count, "a number of decisions"),
     "discount": (lambda value: is_weight(value) and value <= 1, "a number from 0 to 1"),
     "discount_by": (_UNITS.__contains__, '"decision" or "time"'),
     "budget": (is_count, "a number of branches or None"),
@@ -202,9 +66,7 @@ CHECKS: Final[Checks] = {
 }
 """The checks of the options of planners."""
 
-_HORIZON: Final = 'a number of decisions, a positive time with horizon_by="time", or None'
-
-_OPTIONAL: Final = ("horizon", "terminal_value", "budget")
+_OPTIONAL: Final = ("horizon", "hold", "terminal_value", "metric", "budget")
 """The options that may be None."""
 
 
@@ -213,13 +75,16 @@ _OPTIONAL: Final = ("horizon", "terminal_value", "budget")
 
 def action_values(
     env: Environment,
-    actions: Iterable[Action] | None = None,
+    actions: Iterable[Candidate] | Propose | None = None,
     *,
     base: Policy = RULE,
+    hold: float | None = 1,
+    hold_by: str = "decision",
     futures: int = 16,
     horizon: float | None = None,
     horizon_by: str = "decision",
     terminal_value: Callable[[Any], float] | None = None,
+    metric: Metric | None = None,
     discount: float = 1.0,
     discount_by: str = "decision",
     seed: int | None = None,
@@ -227,30 +92,41 @@ def action_values(
     time_limit: float = 600.0,
     progress: bool = False,
 ) -> ActionValues:
-    """Estimate the value of each candidate action of the pending decision by trying it in branches.
+    """Estimate the value of each candidate for the pending decision by trying it in branches.
 
-    In a branch the action is taken, and the agent's base decides from then on, up to the horizon or
-    the agent's end. All candidates meet the same futures. ``env`` itself does not move.
+    In a branch the candidate decides as long as it is held, and the agent's base from then on, up
+    to the horizon or the agent's end. All candidates meet the same futures. ``env`` itself does not
+    move.
 
     Args:
         env: An environment of one simulation with a pending decision, in any view, with or without
             wrappers. In the parallel view, the agent is the one that is ``"deciding"``, and the
             others play the same rounds. In the joint view, one agent acts for all. In the turn
             view, one learner does, and its decisions are the steps.
-        actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
+        actions: The candidates: actions, policies, ``RULE``, or those of ``first``. Or a callable
+            of the observation, or of the observation and the info, that returns them; it gets the
+            pending ``Decision`` as ``_decision``, if it asks. None: all legal actions of a
             ``Discrete``.
         base: The policy that decides after the candidate: ``RULE``, a callable of the observation,
             or of the observation and the info, a dict of these by agent, or the policies of
             ``turn_policy`` or ``joint_policy``. Other agents of the environment follow their entry
             in the dict, else their rule. Agents in the option ``policies`` keep their policies. A
             planner is replaced by its attribute ``base``.
+        hold: The number of decisions that a candidate answers before the base. With
+            ``hold_by="time"``: a duration. None: up to the horizon.
+        hold_by: The unit of ``hold``: "decision", or "time" for the simulation's time.
         futures: The number of futures in which each candidate is tried.
         horizon: The number of the agent's decisions whose rewards count, including the candidate.
-            With ``horizon_by="time"``: a duration; rewards count up to the agent's first decision
-            after at least that time. None: up to the agent's end.
+            With ``horizon_by="time"``: a duration. The reward of the interval in which it ends
+            counts by its share before that; exactly, if another agent decides at that time. None:
+            up to the agent's end.
         horizon_by: The unit of the horizon: "decision", or "time" for the simulation's time.
         terminal_value: A callable of the environment that returns the value of the time after the
-            horizon. It is called in the branch if the agent still lives at the horizon.
+            horizon. It is called in the branch if the agent still lives at its first decision after
+            the horizon, up to which rewards count in full.
+        metric: A callable of the simulation that returns how well it stands; larger is better. It
+            is read at the horizon or the agent's end, and takes the place of rewards. None: rewards
+            count.
         discount: The discount factor, from 0 to 1.
         discount_by: The unit of discounting: "decision" for each decision of the agent before the
             rewarded one, or "time" for each unit of the simulation's time between the candidate and
@@ -262,8 +138,9 @@ def action_values(
         progress: Whether to show a progress bar, by ``tqdm``.
 
     Returns:
-        The values. If the simulation has no ``reseed`` and the environment was not made with
-        ``global_rng=True``, there is only the one exact future, and a warning says so.
+        The values. There is only the one exact future if the simulation says by an attribute
+        ``deterministic = True`` that it has no chance; also, with a warning, if it has no
+        ``reseed`` and the environment was not made with ``global_rng=True``.
 
     Raises:
         ViewError: ``env`` is not an environment of one simulation.
@@ -277,10 +154,13 @@ def action_values(
     policy = RolloutPolicy(
         actions,
         base=base,
+        hold=hold,
+        hold_by=hold_by,
         futures=futures,
         horizon=horizon,
         horizon_by=horizon_by,
         terminal_value=terminal_value,
+        metric=metric,
         discount=discount,
         discount_by=discount_by,
         seed=seed,
@@ -291,7 +171,7 @@ def action_values(
     if player.is_planned:
         return _base_value(player)
     rollouts = Rollouts(player, policy)
-    candidates = range(len(rollouts.actions))
+    candidates = range(len(rollouts.courses))
     with progress_bar(len(candidates) * futures, progress, "branch") as bar:
         for number in [1] * futures if progress else [futures]:
             rollouts.add(candidates, number)
@@ -312,9 +192,10 @@ class Rollouts:
 
     Attributes:
         env: The environment.
-        actions: The candidates.
+        courses: The candidates.
+        given: How many of them were given, before ``RULE`` and the incumbent.
         rule: The index of ``RULE``. Only planners need it.
-        added: Whether ``RULE`` was added to them, as the last one.
+        incumbent: The index of the latest choice of a planner. ``RULE`` without one.
         returns: For each candidate, the returns of its rollouts.
         rollouts: For each sequence of candidates, its rollouts.
         reseeds: Whether chance can be drawn anew. Otherwise there is one exact future.
@@ -326,50 +207,70 @@ class Rollouts:
         policy: RolloutPolicy,
         *,
         planner: bool = False,
+        choice: Choice | None = None,
     ) -> None:
         """Check the candidates and the base of a policy.
 
-        For a ``planner``, leave out masked candidates, and add ``RULE``.
+        For a ``planner``, leave out masked candidates, and add ``RULE`` and the latest ``choice``.
         """
         self.env = player.env
         self.policy = policy
         player.check()
         episode = player.episode
-        is_timed = "time" in (policy.discount_by, policy.horizon_by)
+        is_timed = "time" in (policy.discount_by, policy.horizon_by, policy.hold_by)
         if is_timed and episode.clock is None:
             raise OptionValueError(
-                'discount_by="time" and horizon_by="time" need a simulation with a method time()'
+                'discount_by="time", horizon_by="time" and hold_by="time" need a simulation with a'
+                " method time()"
             )
-        self.actions = player.candidates(policy.actions, legal=planner)
-        rules = [index for index, action in enumerate(self.actions) if action is RULE]
-        number = len(self.actions)
-        self.rule = rules[0] if rules else number
-        self.added = planner and not rules and number > 1
-        if self.added:
-            self.actions.append(RULE)
-        self.returns: list[list[float]] = [[] for _ in self.actions]
+        incumbent = None if choice is None else choice.candidate
+        found = player.candidates(policy.actions, legal=planner, incumbent=incumbent)
+        self.courses = [Course(candidate) for candidate in found]
+        self.given = len(found)
+        self.rule = self.incumbent = 0
+        if planner:
+            self.rule = self.incumbent = self._include(Course(RULE))
+        if choice is not None:
+            course = choice.resume(policy, player.time())
+            if player.allows(course.part(0)):
+                self.incumbent = self._include(course)
+        self.returns: list[list[float]] = [[] for _ in self.courses]
         self.rollouts: dict[Indices, list[Rollout]] = {}
-        agent = player.agent
         self._entropy = [
             episode.seed,
-            agent.answered if getattr(agent.policy, "plans", False) else episode.turns,
+            player.agent.answered
+            if getattr(player.agent.policy, "plans", False)
+            else episode.turns,
             crc32(player.name.encode(errors="surrogatepass")),
             _KEY,
         ]
         if policy.seed is not None:
             self._entropy.append(policy.seed)
         self._name = episode.plan.name
+        self.reseeds = not player.view.call(_is_deterministic) and self._can_reseed(player)
+
+    def _include(self, course: Course) -> int:
+        """Return the index of a candidate. Add it if it is new."""
+        if not course.decisions:
+            for index, other in enumerate(self.courses):
+                if _is_same(course.candidate, other.candidate):
+                    return index
+        self.courses.append(course)
+        return len(self.courses) - 1
+
+    def _can_reseed(self, player: Player) -> bool:
+        """Return whether chance can be drawn anew. Warn if not."""
         try:
             player.view.session.check_reseed()
-            self.reseeds = True
         except BranchError:
-            self.reseeds = False
             warn_user(
                 f"{self._name} cannot draw new random numbers in a branch: the planner tries all"
                 " candidates on the one future that will happen, and so foresees chance. Give it a"
-                " method reseed(seed), empty if nothing is random, or set global_rng=True if it"
-                " draws from random or numpy.random"
+                " method reseed(seed), or set global_rng=True if it draws from random or"
+                " numpy.random, or deterministic = True if nothing is random"
             )
+            return False
+        return True
 
     def seeds(self, number: int) -> list[int]:
         """Return the seeds of the first futures."""
@@ -391,7 +292,7 @@ class Rollouts:
 
     def trying(self, tries: Sequence[Try]) -> partial[Rollout]:
         """Return the function that makes tries in branches."""
-        return partial(try_out, tries=tries, actions=self.actions, policy=self.policy)
+        return partial(try_out, tries=tries, courses=self.courses, task=self.policy)
 
     def make(self, tries: Sequence[Try]) -> list[Rollout]:
         """Make rollouts, each in a branch."""
@@ -421,7 +322,7 @@ class Rollouts:
 
     def search(self, budget: int) -> Indices:
         """Try candidates; return the best ones for the next decisions."""
-        left = list(range(len(self.actions)))
+        left = list(range(len(self.courses)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
             most = budget // len(left)
             number = min(max(1, most // rounds), most)
@@ -433,24 +334,37 @@ class Rollouts:
         best = max(left, key=self.mean)
         return (best,)
 
-    def is_better_than_rule(self, indices: Indices) -> bool:
-        """Return whether candidates have a larger return than the rule.
+    def settle(self, best: Indices) -> int:
+        """Return the index of the candidate that is taken: the best, the incumbent or ``RULE``.
 
-        They are compared on fresh futures, because the others have selected them.
+        The best must be better than both, on fresh futures, because the others have selected it.
         """
-        if indices[0] == self.rule:
-            return False
-        rule = (self.rule,)
-        if not self.reseeds:
-            return self.exact_return(indices) > self.exact_return(rule)
+        if best[0] == self.rule == self.incumbent:
+            return self.rule
+        contenders = list(dict.fromkeys([best, (self.incumbent,), (self.rule,)]))
+        if self.reseeds:
+            returns = self._make_fresh(contenders)
+        else:
+            returns = np.array([[self.exact_return(indices)] for indices in contenders])
+        means = returns.mean(axis=1)
+        rule = contenders.index((self.rule,))
+        incumbent = contenders.index((self.incumbent,))
+        safe = incumbent if means[incumbent] >= means[rule] else rule
+        gains = returns[0] - returns[[rule, incumbent]]
+        margins = np.zeros(2)
+        if self.reseeds:
+            errors = gains.std(axis=1, ddof=1) / np.sqrt(gains.shape[1])
+            margins = self.policy.margin * errors
+        is_better = (gains.mean(axis=1) > margins).all()
+        return contenders[0 if is_better else safe][0]
+
+    def _make_fresh(self, contenders: Sequence[Indices]) -> NDArray[np.float64]:
+        """Return the returns of candidates, a row for each, in futures that were not tried yet."""
         begin = max(map(len, self.returns))
         futures = range(begin, begin + max(_FRESH, self.policy.futures))
-        tries = list(product((indices, rule), futures))
-        returns = np.array([sum(rollout.rewards) for rollout in self.make(tries)])
-        planned, ruled = np.split(returns, 2)
-        gains = planned - ruled
-        error = gains.std(ddof=1) / np.sqrt(len(gains))
-        return bool(gains.mean() > self.policy.margin * error)
+        tries = list(product(contenders, futures))
+        returns = [sum(rollout.rewards) for rollout in self.make(tries)]
+        return np.reshape(returns, (len(contenders), len(futures)))
 
     def exact_return(self, indices: Indices) -> float:
         """Return the return of candidates in the one exact future."""
@@ -462,7 +376,8 @@ class Rollouts:
 
     def values(self, best: int) -> ActionValues:
         """Estimate the values. The best candidate is given by its index."""
-        values = estimate(self.actions, self.returns, best)
+        candidates = [course.candidate for course in self.courses]
+        values = estimate(candidates, self.returns, best)
         rollouts = self.rollouts.values()
         if self.reseeds:
             futures = [[(each.rewards, each.digest) for each in same] for same in rollouts]
@@ -470,6 +385,18 @@ class Rollouts:
         if self.policy.horizon is not None and self.policy.horizon_by == "decision":
             warn_of_times(self._name, [each.times for each in chain(*rollouts)])
         return values
+
+
+def _is_deterministic(view: Any) -> bool:
+    """Return whether a simulation says that it has no chance."""
+    return getattr(view.episode.simulation, "deterministic", False) is True
+
+
+def _is_same(one: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates are the same."""
+    if is_policy(one) or is_policy(other) or isinstance(one, First) or isinstance(other, First):
+        return one is other
+    return same(one, other)
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -483,9 +410,11 @@ class RolloutPolicy:
     In each round, all remaining candidates are tried on the same futures, and the better half of
     them remains.
 
-    ``RULE`` is always a candidate. Another one is taken only if its paired advantage over ``RULE``,
-    on at least eight fresh futures, exceeds ``margin`` standard errors. Where there is one exact
-    future, any gain is taken.
+    ``RULE`` is always a candidate, and so is the incumbent: the planner's latest choice for the
+    agent, for as long as it was to be held. Another one is taken only if its paired advantages over
+    both, on at least eight fresh futures, exceed ``margin`` standard errors. Otherwise the
+    incumbent stays if its mean there is at least that of ``RULE``; else ``RULE`` decides. Where
+    there is one exact future, any gain is taken.
 
     The policy can be used like any policy that answers one decision at a time; it gets the
     environment as ``_environment``. In a branch of a planner it acts as its own base.
@@ -493,11 +422,13 @@ class RolloutPolicy:
     Its attributes are its arguments. ``action_values`` describes the others.
 
     Attributes:
-        actions: The candidates. Candidates that are masked at a decision are left out there. None:
-            all legal actions of a ``Discrete``.
+        actions: The candidates. Candidates that are masked at a decision are left out there. A
+            callable gets the incumbent, or None, as ``_incumbent``, if it asks. None: all legal
+            actions of a ``Discrete``.
+        every: It plans at each decision with that number. In between, its choice goes on.
         budget: The number of branches per decision. None: the number of candidates times
-            ``futures``. The comparison with the rule comes on top.
-        margin: By how many standard errors a candidate must be better than ``RULE`` to be taken.
+            ``futures``. The comparison with the rule and the incumbent comes on top.
+        margin: By how many standard errors a candidate must be better to be taken.
         futures: The mean number of futures per candidate, if there is no ``budget``.
         seed: A number that distinguishes the futures from the ones of another planner.
 
@@ -505,12 +436,16 @@ class RolloutPolicy:
         OptionValueError: An argument has an invalid value.
     """
 
-    actions: Iterable[Action] | None = field(default=None, kw_only=False)
+    actions: Iterable[Candidate] | Propose | None = field(default=None, kw_only=False)
     base: Policy = RULE
+    hold: float | None = 1
+    hold_by: str = "decision"
+    every: int = 1
     futures: int = 16
     horizon: float | None = None
     horizon_by: str = "decision"
     terminal_value: Callable[[Any], float] | None = None
+    metric: Metric | None = None
     discount: float = 1.0
     discount_by: str = "decision"
     seed: int | None = None
@@ -522,8 +457,10 @@ class RolloutPolicy:
     _rollouts: ClassVar[type[Rollouts]] = Rollouts
 
     def __post_init__(self) -> None:
-        horizon = is_count if self.horizon_by == "decision" else is_positive
-        checks = self._checks | {"horizon": (horizon, _HORIZON)}
+        checks = dict(self._checks)
+        for name, unit in (("horizon", self.horizon_by), ("hold", self.hold_by)):
+            kind = f'a number of decisions, a positive time with {name}_by="time", or None'
+            checks[name] = (is_positive if unit == "time" else is_count), kind
         for name, (is_valid, kind) in checks.items():
             value = vars(self)[name]
             is_left_out = value is None and name in _OPTIONAL
@@ -540,8 +477,8 @@ class RolloutPolicy:
             env: The environment, as ``action_values`` takes it. It does not move.
 
         Returns:
-            The values. ``best`` is ``RULE`` or a candidate of the last round. A single candidate is
-            not tried.
+            The values. ``best`` is ``RULE``, the incumbent or a candidate of the last round.
+            ``RULE`` alone is not tried.
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
@@ -550,8 +487,9 @@ class RolloutPolicy:
         player = player_of(env, self.base)
         if player.is_planned:
             return _base_value(player)
-        rollouts = self._rollouts(player, self, planner=True)
-        number = len(rollouts.actions)
+        choice = self._latest(player)
+        rollouts = self._rollouts(player, self, planner=True, choice=choice)
+        number = len(rollouts.courses)
         budget = self.budget
         if budget is None:
             budget = number * self.futures
@@ -559,15 +497,34 @@ class RolloutPolicy:
             raise OptionValueError(
                 f"a budget of {budget} branches is too small to try {number} candidates once"
             )
-        if number == 1:
-            return rollouts.values(0)
-        best = rollouts.search(budget)
-        if rollouts.is_better_than_rule(best):
-            return rollouts.values(best[0])
-        return rollouts.values(rollouts.rule)
+        taken = rollouts.rule
+        if number > 1:
+            taken = rollouts.settle(rollouts.search(budget))
+        values = rollouts.values(taken)
+        if choice is None or not rollouts.courses[taken].decisions:
+            choice = Choice(values.best, player.time(), player.number)
+        self._keep(player, replace(choice, age=0))
+        return values
+
+    def _latest(self, player: Player) -> Choice | None:
+        """Return the latest choice for an agent, as it stands at the pending decision."""
+        choice: Choice | None = player.episode.memory.get((self, player.name))
+        return None if choice is None else self._keep(player, choice.at(player.number))
+
+    def _keep(self, player: Player, choice: Choice) -> Choice:
+        """Keep a choice for the agent's next decision."""
+        player.episode.memory[self, player.name] = choice
+        return choice
 
     def __call__(
         self, observation: Observation, info: Info, *, _environment: Environment
     ) -> Action:
-        """Answer a decision with the best action. In a branch, with the answer of the base."""
-        return self.choose(_environment).best
+        """Answer a decision with the best candidate. In a branch, with the answer of the base."""
+        player = player_of(_environment, self.base)
+        if player.is_planned:
+            return player.decide()
+        choice = self._latest(player)
+        if choice is None or choice.age >= self.every:
+            self.choose(_environment)
+            choice = self._latest(player)
+        return RULE if choice is None else player.answer(choice.part)

@@ -17,18 +17,9 @@ from typing import Any, ClassVar, Final
 from ..core import branch, clone, pending_view
 from ..envs import SimulationJointEnv, SimulationTurnEnv
 from ..errors import BranchError, OptionValueError
-from .rollouts import (
-    BEGIN,
-    CHECKS,
-    Checks,
-    Indices,
-    Rollout,
-    RolloutPolicy,
-    Rollouts,
-    Try,
-    is_count,
-    is_weight,
-)
+from .candidates import First
+from .rollout import BEGIN, Indices, Rollout, Try
+from .rollouts import CHECKS, Checks, RolloutPolicy, Rollouts, is_count, is_weight
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated.
@@ -43,15 +34,18 @@ _MOST: Final = 200
 class Tree(Rollouts):
     """The rollouts of sequences of candidates, which are the nodes of a tree.
 
-    If ``RULE`` was added to the candidates, as the last one, it is a leaf.
+    Candidates that decide to the horizon, and those that were added, are leaves.
     """
 
     policy: TreeSearchPolicy
 
     def search(self, budget: int) -> Indices:
         """Try nodes; return the best one."""
-        self._candidates = range(len(self.actions))
-        self._inner = self._candidates[: len(self.actions) - self.added]
+        self._candidates = list(range(len(self.courses)))
+        given = self.courses[: self.given]
+        self._inner = [
+            index for index, course in enumerate(given) if not isinstance(course.candidate, First)
+        ]
         self._visits: Counter[Indices] = Counter()  # also by tries that are running
         self._returns: dict[Indices, list[float]] = {}  # from the node's own decision on
         self._totals: list[float] = []
@@ -62,7 +56,7 @@ class Tree(Rollouts):
                 results = (checkpoints or self).make(tries)
                 self.record(tries, results)
                 for (node, _), rollout in zip(tries, results, strict=True):
-                    self.learn(node, rollout.rewards)
+                    self.learn(node, rollout)
                 if begin == 0:
                     checkpoints = self.begin_checkpoints()
         finally:
@@ -132,19 +126,20 @@ class Tree(Rollouts):
     def learn(
         self,
         node: Indices,
-        rewards: Sequence[float],
+        rollout: Rollout,
     ) -> None:
-        """Add the rewards of a try, by decision. The agent may have ended before the node."""
-        for depth in range(min(len(node), len(rewards))):
-            self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
-        self._totals.append(sum(rewards))
+        """Add the rewards of a try, by candidate. The agent may have ended before the last."""
+        for depth, begin in enumerate(rollout.begins):
+            returned = sum(rollout.rewards[begin:])
+            self._returns.setdefault(node[: depth + 1], []).append(returned)
+        self._totals.append(sum(rollout.rewards))
 
     def best(self) -> Indices:
-        """Return the best node without the added ``RULE``: by lower bound, then by visits."""
+        """Return the best node but for ``RULE``: by lower bound, then by visits."""
         lower = partial(self._bound, doubt=-1.0)
-        first = [(index,) for index in self._inner]
+        first = [(index,) for index in self._candidates if index != self.rule]
         node: Indices = max(first, key=lower)
-        while len(node) < self.policy.depth:
+        while len(node) < self.policy.depth and node[0] in self._inner:
             children = [(*node, index) for index in self._inner]
             tried = [child for child in children if child in self._returns]
             if not tried:

@@ -245,6 +245,8 @@ class RemoteSession(BaseSession):
         self._is_renewed = False  # whether there may be another episode than at first
         with fork.watch():  # an error ends the process
             self._mirror(fork.start())
+        if self.episode is not None and original.episode is not None:
+            self.episode.remember(original.episode)
 
     @property
     def simulation(self) -> Model:

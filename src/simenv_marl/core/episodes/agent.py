@@ -514,6 +514,11 @@ class Agent:
         self.reward = 0.0 if carry_on else total
         self._carried = total if carry_on else 0.0
 
+    def reward_so_far(self) -> float:
+        """In a branch, return the reward of its latest action by now."""
+        self.refresh()
+        return self.reward + self._carried
+
     def pay(self, reward: float) -> None:
         """Set the reward to the team's."""
         self.reward = reward

@@ -70,7 +70,6 @@ class Episode(EpisodeState):
         called: The functions that end agents and were called.
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
-        memory: The values of policies for all agents.
         moved: The names of agents that have decided at several points.
         end_states: The states at the ends of agents midway. None if no learner has asked for any.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
@@ -79,9 +78,9 @@ class Episode(EpisodeState):
 
     __slots__ = (
         "_expected_calls", "_failed_in_model", "_handlers", "_latest_state", "_most_steps",
-        "_observes", "_plugins", "_split", "_tape_size", "called", "context", "driver",
-        "end_states", "is_plain", "latest", "memory", "moved", "replay", "running", "session",
-        "simulation", "tape", "team",
+        "_notice", "_observes", "_plugins", "_split", "_tape_size", "called", "context", "driver",
+        "end_states", "is_plain", "latest", "moved", "replay", "running", "session", "simulation",
+        "tape", "team",
     )  # fmt: skip
 
     def __init__(
@@ -108,9 +107,9 @@ class Episode(EpisodeState):
         self.latest: Agent | None = None
         self.called: set[Hook] = set()
         self.running = True
+        self._notice: Callable[[], None] | None = None
         self._failed_in_model = False
         self._most_steps = plan.options.max_steps or maxsize
-        self.memory: dict[object, Any] = {}
         self.moved: set[str] = set()
         self.team: Team | None = None
         if plan.options.team_reward is not None:
@@ -183,10 +182,8 @@ class Episode(EpisodeState):
             reply = self.answer(agent, action)
             self.advance(reply)
         except BaseException as error:
-            if self.pending is None:
-                self.fail(error)
-            else:
-                self.annotate(error)
+            refuse = self.fail if self.pending is None else self.annotate
+            refuse(error)
             raise
 
     def _enter_and_step(self, action: Action) -> None:
@@ -274,10 +271,7 @@ class Episode(EpisodeState):
     # -- decisions --------------------------------------------------------------------------------
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
-        """Handle a decision in a round, with skipped forced moves, or after the last step.
-
-        Return the agent if it waits for the user, else the reply.
-        """
+        """Handle a decision in a round, with skipped forced moves, or after the last step."""
         self.latest = agent
         if self.round is not None:
             if agent.point.legal is not None or agent.clock is not None:
@@ -342,6 +336,8 @@ class Episode(EpisodeState):
         if self.plan.one_agent in self.ended:  # else it might run for ever without a user
             self.finish(truncated=False)
             return WAIT
+        if self._notice is not None:
+            self._notice()
         policy = agent.policy
         if policy is RULE:
             return RULE
@@ -492,10 +488,7 @@ class Episode(EpisodeState):
         self.latest = pending or self.latest
 
     def _keep_announced(self, deciding: Agent | None, *, everyone: bool = False) -> None:
-        """Hold the arguments of the calls that ``expected_calls`` announces, one for each agent.
-
-        ``everyone``: also for agents that a policy answers.
-        """
+        """Hold the arguments of announced calls, of ``everyone`` or of the user's agents."""
         expected_calls = self._expected_calls
         if expected_calls is None:
             return
@@ -582,6 +575,10 @@ class Episode(EpisodeState):
                 agent.update(*agent.arguments.recall(), observe=False)
         self.consulted = None
         self.pending = agent
+
+    def watch(self, notice: Callable[[], None]) -> None:
+        """In a branch, call a function at each decision that no user answers."""
+        self._notice = notice
 
     def delegate(self, policies: Mapping[str, Policy]) -> None:
         """In a branch, let policies answer for the agents that follow the rule."""

@@ -384,6 +384,8 @@ class Session(BaseSession):
             else:
                 episode.step(answer)
         episode.end_replay()
+        if original.episode is not None:
+            episode.remember(original.episode)
         if not same(_pending_decision(episode), recording.decision):
             raise BranchError(
                 f"{type(self._simulation).__name__} does not repeat its decisions with the same"

@@ -12,9 +12,10 @@ An episode::
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from copy import copy
 from enum import Enum
 from threading import current_thread
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ...errors import (
     ClosedError,
@@ -175,11 +176,12 @@ class EpisodeState:
         earned: The team's reward of the latest step. None if each agent has its own rewards.
         skips: Whether a decision with one legal action is answered with it.
         where: Where it is played, which determines the policies that are asked.
+        memory: The values of planners, and of policies for all agents.
     """
 
     __slots__ = (
         "_deciders", "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined",
-        "just_ended", "others", "outcome", "pending", "plan", "round", "seed", "skips",
+        "just_ended", "memory", "others", "outcome", "pending", "plan", "round", "seed", "skips",
         "turns", "unreported_end", "where",
     )  # fmt: skip
 
@@ -204,7 +206,12 @@ class EpisodeState:
         self._deciders = 0
         self.unreported_end = False
         self.turns = 0
+        self.memory: dict[object, Any] = {}
         self._fault = ""
+
+    def remember(self, other: EpisodeState) -> None:
+        """Take over the values of policies in an episode that this one continues."""
+        self.memory = {policy: copy(value) for policy, value in other.memory.items()}
 
     @property
     def state(self) -> State:

@@ -92,7 +92,8 @@ def test_fresh_futures_compare_it_with_the_rule(kind, futures, fresh, monkeypatc
         return branch(*given, seeds=seeds, **options)
 
     monkeypatch.setattr(rollouts, "branch", noted)
-    told = kind(actions=[1, 2], futures=futures, horizon=1).choose(made(world(gain=1.0)))
+    planner = kind(actions=[1, 2], futures=futures, horizon=1, method="fork")
+    told = planner.choose(made(world(gain=1.0)))
     searched, confirmed = [seed for seeds in calls[:-1] for seed in seeds], calls[-1]
     assert told.best != RULE
     assert len(searched) == told.counts.sum() >= 3 * futures - 1

@@ -148,18 +148,20 @@ class Player:
             InvalidActionError: A candidate is not legal, or all of them are masked.
         """
         space = self._space_of(self.name)
+        mask = self.mask
         if callable(actions):
             actions = self._propose(actions, incumbent)
         if actions is None and isinstance(space, spaces.Discrete):
             legal = True
-            first = int(space.start)
-            actions = list(range(first, first + int(space.n)))
+            actions = list(range(space.n))
+            if self.env is self.view and mask is not None:
+                actions = np.flatnonzero(mask).tolist()
+            actions = [int(space.start) + index for index in actions]
         if not isinstance(actions, list) or not actions:
             raise OptionValueError(
                 "actions must be a list of candidates, or None for all legal actions of a"
                 f" Discrete, not {short_repr(actions)}; the action space is {short_repr(space)}"
             )
-        mask = self.mask
         for action in actions:
             self.check_candidate(action, None if legal else mask)
         candidates = [action for action in actions if not legal or self.allows(action)]
@@ -336,7 +338,8 @@ class Player:
         """Return whether the rule can decide to the end, and nothing is observed."""
         is_free = self.env is self.view and self.base is RULE
         plan = self.episode.plan
-        return is_free and plan.options.max_steps is None and not plan.removers
+        ends_alone = plan.one_agent is not None or not plan.removers
+        return is_free and ends_alone and plan.options.max_steps is None
 
     def run_out(self) -> None:
         """Let the rule decide to the end of the simulation. Observe nothing before that."""

@@ -515,7 +515,7 @@ class Episode(EpisodeState):
 
         An agent that a policy answers is observed for the last time, if others see that.
         """
-        is_other = agent.delegated
+        is_other = agent.name not in self.agents  # a branch may have delegated the user's agents
         is_seen = self._observes or getattr(agent.policy, "sees_all", False)
         if is_other and not is_seen:
             return

@@ -40,7 +40,8 @@ def simulate(
             ``Variant``.
         policies: The policies: a dict from an agent or a decision point to a callable. The callable
             gets the observation, or the observation and the info, and returns an action. A
-            keyword-only parameter ``_state`` gets the simulation's state.
+            keyword-only parameter ``_state`` gets the simulation's state, ``_simulation`` the
+            simulation itself.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
             ``policies``, there are no decision points and the plain model runs.
         seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is
@@ -101,8 +102,8 @@ def simulate_many(
             same policy object, their decisions share batches. One batch never mixes different
             spaces. A keyword-only parameter ``_state`` gets the stacked states of the simulations,
             as ``state()`` of an environment returns them. The policies of a ``Variant`` answer one
-            decision at a time; so do policies that ask for ``_environment`` or ``_decision``, and
-            coroutine functions, which are awaited.
+            decision at a time; so do policies that ask for ``_environment``, ``_decision`` or
+            ``_simulation``, and coroutine functions, which are awaited.
         seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
             ``policies``, there are no decision points and the plain models run.

@@ -12,7 +12,7 @@ This module lists the interface of the core. The rooms of the package use nothin
 """
 
 from ..simulation import Action, Model, Observation
-from .copies.clone import branch, clone, pending_view, replay_in_forks
+from .copies.clone import branch, clone, pending_view
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from .copies.peer import Peer, pack_request, serve
 from .episodes.agent import Agent
@@ -83,8 +83,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "split_extras", "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
-    "pack_request", "pending_view", "portable", "release", "replay_in_forks", "reuse_resources",
-    "serve", "unpack", "unpack_outcome",
+    "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
+    "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
     "common_observations", "duplicate", "explain_arguments", "joined",

@@ -82,8 +82,8 @@ class Evaluation:
         seats: A ``DataFrame`` with one row for each contender and agent. Columns: ``decisions``;
             ``asked``, those that were put to a ``FallbackPolicy``; ``fallbacks``, those that its
             fallback answered; ``seconds``, the time that policies with ``_decision``,
-            ``_environment`` or ``_state`` took for all answers; ``tokens`` of language models; and
-            all other numbers that policies have counted by ``Decision.count``.
+            ``_environment``, ``_simulation`` or ``_state`` took for all answers; ``tokens`` of
+            language models; and all other numbers that policies have counted by ``Decision.count``.
 
     In all methods, ``metric`` is ``"return"``, ``"length"`` or the name of a metric; another one is
     an ``OptionValueError``.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Protocol
 from zlib import crc32
@@ -43,10 +43,6 @@ class Rollout:
     over: bool = False
     digest: int = 0
     seconds: float = 0.0
-
-    def equals(self, other: Rollout) -> bool:
-        """Return whether another rollout is the same, but for the real time."""
-        return replace(self, seconds=other.seconds) == other
 
 
 BEGIN: Final = Rollout()

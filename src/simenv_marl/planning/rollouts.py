@@ -5,20 +5,18 @@ Policies that decide by these values.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
-from math import ceil, inf, log2
-from time import perf_counter
+from math import ceil, log2
 from typing import Any, ClassVar, Final, TypeAlias, TypeGuard
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Info, Policy, branch, checked_seed, is_seed, replay_in_forks, same
+from ..core import Info, Policy, branch, checked_seed, is_seed, same
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
@@ -187,14 +185,6 @@ def _base_value(player: Player) -> ActionValues:
     return estimate([player.decide()], [[]], 0)
 
 
-@dataclass(frozen=True)
-class Speeds:
-    """The seconds for a rollout in an episode, by ways to make it; -1.0 if unknown."""
-
-    fork: float = -1.0
-    replay: float = -1.0
-
-
 class Rollouts:
     """The rollouts of the candidates for a pending decision.
 
@@ -226,7 +216,7 @@ class Rollouts:
         self.env = player.env
         self.policy = policy
         player.check()
-        self._episode = episode = player.episode
+        episode = player.episode
         is_timed = "time" in (policy.discount_by, policy.horizon_by, policy.hold_by)
         if is_timed and episode.clock is None:
             raise OptionValueError(
@@ -244,13 +234,12 @@ class Rollouts:
             course = choice.resume(policy, player.time())
             if player.allows(course.part(0)):
                 self.incumbent = self._include(course)
+        agent = player.agent
         self.returns: list[list[float]] = [[] for _ in self.courses]
         self.rollouts: dict[Indices, list[Rollout]] = {}
         self._entropy = [
             episode.seed,
-            player.agent.answered
-            if getattr(player.agent.policy, "plans", False)
-            else episode.turns,
+            agent.answered if getattr(agent.policy, "plans", False) else episode.turns,
             crc32(player.name.encode(errors="surrogatepass")),
             _KEY,
         ]
@@ -305,66 +294,18 @@ class Rollouts:
         return partial(try_out, tries=tries, courses=self.courses, task=self.policy)
 
     def make(self, tries: Sequence[Try]) -> list[Rollout]:
-        """Make rollouts, each in a branch: in a process of its own, or with others in one."""
-        memory = self._episode.memory
-        speeds: Speeds = memory.setdefault(Speeds, Speeds())
-        if self.policy.method is None and tries and speeds.replay < speeds.fork:
-            began = perf_counter()
-            try:
-                replayed = self._replay(tries)
-            except BranchError:  # the simulation does not repeat itself
-                replayed = None
-            if replayed is not None:
-                memory[Speeds] = replace(speeds, replay=(perf_counter() - began) / len(tries))
-                return replayed
-            memory[Speeds] = speeds = replace(speeds, replay=inf)
-        began = perf_counter()
-        rollouts = self._branch(tries)
-        fork = (perf_counter() - began) / max(1, len(tries))
-        if self.policy.method is None and tries and speeds.replay == -1.0:
-            memory[Speeds] = Speeds(fork, self._seconds_to_replay(tries, rollouts))
-        return rollouts
-
-    def _seconds_to_replay(self, tries: Sequence[Try], rollouts: Sequence[Rollout]) -> float:
-        """Return the seconds for a replay. Infinity if replays are not like the rollouts."""
-        few = tries[: len(os.sched_getaffinity(0))]
-        began = perf_counter()
-        try:
-            replayed = self._replay(few)
-        except BranchError:
-            replayed = None
-        seconds = (perf_counter() - began) / len(few)
-        if replayed is None:
-            return inf
-        is_like = all(map(Rollout.equals, replayed, rollouts[: len(few)]))
-        return seconds if is_like else inf
-
-    def _seeds_of(self, tries: Sequence[Try]) -> list[int] | None:
-        """Return the seeds of the futures of tries. None: they have the exact one."""
-        if not self.reseeds:
-            return None
-        futures = [future for _, future in tries]
-        known = self.seeds(1 + max(futures, default=0))
-        return [known[future] for future in futures]
-
-    def _replay(self, tries: Sequence[Try]) -> list[Rollout] | None:
-        """Make rollouts by replays. None where this is not possible."""
-        return replay_in_forks(
-            self.env,
-            self.trying(tries),
-            len(tries),
-            seeds=self._seeds_of(tries),
-            time_limit=self.policy.time_limit,
-        )
-
-    def _branch(self, tries: Sequence[Try]) -> list[Rollout]:
-        """Make rollouts, each in a process of its own where that is possible."""
+        """Make rollouts, each in a branch."""
+        seeds: list[int] | None = None
+        if self.reseeds:
+            futures = [future for _, future in tries]
+            known = self.seeds(1 + max(futures, default=0))
+            seeds = [known[future] for future in futures]
         return branch(
             self.env,
             self.trying(tries),
             len(tries),
             method=self.policy.method,
-            seeds=self._seeds_of(tries),
+            seeds=seeds,
             time_limit=self.policy.time_limit,
         )
 

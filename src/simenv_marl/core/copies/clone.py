@@ -200,47 +200,6 @@ def branch(
         return [_call_on_clone(env, call, number, method) for number in range(n)]
 
 
-def replay_in_forks(
-    env: Any,
-    function: Callable[[Any, int], Result],
-    n: int,
-    *,
-    seeds: Sequence[int] | None = None,
-    time_limit: float = 600.0,
-) -> list[Result] | None:
-    """Call a function on continuations like ``branch``. A forked process for each core replays its.
-
-    This is quicker than a fork for each continuation where the simulation is quick.
-
-    Returns:
-        The results. None if the environment cannot be forked here.
-
-    Raises:
-        BranchError: The simulation does not repeat its decisions; also as ``branch``.
-        BaseException: As ``branch``.
-    """
-    view = pending_view(env, "branch")
-    if isinstance(view.session, RemoteSession) or not CAN_FORK or view.driver != "greenlet":
-        return None
-    separate = separator_of(view.session.episode, None)
-    if separate is None:
-        return None
-    if seeds is not None:
-        _check_seeds(seeds, n)
-    call = partial(_call_deeper, function, seeds)
-    cores = min(len(os.sched_getaffinity(0)), n)
-
-    def call_share(first: int) -> list[Result]:
-        with reuse_resources():
-            return [
-                _call_on_clone(env, call, number, "replay") for number in range(first, n, cores)
-            ]
-
-    limit = time_limit * -(-n // max(cores, 1))
-    shares = _call_in_forks(call_share, cores, separate, limit)
-    return [shares[number % cores][number // cores] for number in range(n)]
-
-
 def pending_view(env: Any, user: str) -> Any:
     """Return the unwrapped environment whose decision is pending, for a user named in errors."""
     view = getattr(env, "unwrapped", env)

@@ -43,7 +43,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.planning import RolloutPolicy, action_values
-from simenv_marl.planning.player import player_of
+from simenv_marl.planning.players import player_of
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
 from tests.test_branch import METHODS

@@ -146,7 +146,7 @@ def test_a_metric_takes_the_place_of_rewards(driver, method):
 
 
 def _seeds(env, number):
-    from simenv_marl.planning.player import player_of
+    from simenv_marl.planning.players import player_of
     from simenv_marl.planning.rollouts import Rollouts
 
     return Rollouts(player_of(env, RULE), RolloutPolicy([RULE])).seeds(number)

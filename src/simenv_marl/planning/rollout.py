@@ -12,7 +12,8 @@ from zlib import crc32
 from ..core import Agent, Policy
 from ..errors import annotate, short_repr
 from .candidates import Course, Hold
-from .player import Environment, Metric, Player, number_of, player_of
+from .player import Environment, Metric, Player, number_of
+from .players import player_of
 
 Indices = tuple[int, ...]
 """The indices of the candidates of a rollout, in the order in which they decide."""

@@ -21,7 +21,8 @@ from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
 from .candidates import Candidate, Choice, Course, First, Propose, is_policy
-from .player import Environment, Metric, Player, is_number, player_of
+from .player import Environment, Metric, Player, is_number
+from .players import player_of
 from .rollout import Indices, Rollout, Try, try_out
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 

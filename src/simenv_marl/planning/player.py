@@ -72,8 +72,8 @@ class Player:
         base: The policy after the candidate, or policies by agent.
         over: Whether the agent's episode has ended.
         latest: The observations and infos of the latest step, by agent. Empty before a step.
-        noted: The time of the first decision of another agent after a horizon, and what was
-            measured there. None: there was none.
+        noted: The time of the first decision of another agent after a horizon, and the metric or
+            the reward then. None: there was none.
     """
 
     sees_rewards = True

@@ -1,4 +1,4 @@
-"""One rollout: a branch in which candidates decide, and then the base, up to a horizon."""
+"""One rollout: in a branch, candidates decide, and then the base, up to a horizon."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .player import Environment, Metric, Player, number_of
 from .players import player_of
 
 Indices = tuple[int, ...]
-"""The indices of the candidates of a rollout, in the order in which they decide."""
+"""The indices of the candidates of a rollout, in the order of their decisions."""
 
 Try = tuple[Indices, int]
 """A rollout to make: its candidates, and the number of its future."""
@@ -31,7 +31,7 @@ class Rollout:
             last decision, and 0.0 before it.
         times: The simulation's times between the agent's decisions.
         start: The simulation's time at its begin. None before that.
-        begins: The numbers of the decisions at which its candidates began to decide.
+        begins: The number of the first decision of each candidate.
         over: Whether it is at the horizon, or the agent's episode has ended.
         digest: A digest of the agent's last observation and info.
         seconds: The mean real time for a step, in seconds.
@@ -83,7 +83,7 @@ def try_out(
         courses: The candidates.
         task: The planner.
         begun: The rollout to continue, at a decision where the next candidate begins.
-        stop: The number of candidates after which it stops. None: it runs to its end.
+        stop: The number of candidates to run. None: all, and then the base, to the end.
     """
     indices, future = tries[number]
     path = [courses[index] for index in indices]
@@ -138,7 +138,7 @@ class Trial:
         self._begin = self._now  # of the candidate that decides
         if self.begins:
             self._begin = self.start + sum(self.times[: self.begins[-1]])
-        self._cut: float | None = None  # the time at which the last interval is cut
+        self._cut: float | None = None  # the time of the horizon, if it cuts the last interval
         is_timed = task.horizon_by == "time"
         if task.horizon is not None and is_timed and task.terminal_value is None:
             self._cut = self.start + task.horizon

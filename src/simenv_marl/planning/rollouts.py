@@ -118,13 +118,13 @@ def action_values(
         hold_by: The unit of ``hold``: "decision", or "time" for the simulation's time.
         futures: The number of futures in which each candidate is tried.
         horizon: The number of the agent's decisions whose rewards count, including the candidate.
-            With ``horizon_by="time"``: a duration. The reward of the interval in which it ends
-            counts by its share before that; exactly, if another agent decides at that time. None:
-            up to the agent's end.
+            With ``horizon_by="time"``: a duration. The reward of the last interval counts by its
+            share before the horizon; it is exact if another agent decides at that time. None: up to
+            the agent's end.
         horizon_by: The unit of the horizon: "decision", or "time" for the simulation's time.
         terminal_value: A callable of the environment that returns the value of the time after the
-            horizon. It is called in the branch if the agent still lives at its first decision after
-            the horizon, up to which rewards count in full.
+            horizon. It is called in the branch at the agent's first decision after the horizon, if
+            there is one. The rewards before that decision count in full.
         metric: A callable of the simulation that returns how well it stands; larger is better. It
             is read at the horizon or the agent's end, and takes the place of rewards. None: rewards
             count.

@@ -342,6 +342,23 @@ def test_clones_take_the_incumbent_along(method):
         each.close()
 
 
+@METHODS
+def test_clones_go_on_with_the_choices_of_planners_in_policies(method):
+    planner = RolloutPolicy([short, long], futures=2, metric=lambda works: works.clock, every=3)
+    env = begun(single_env(Works, points(), agent="watchman", policies={"machine": planner}))
+    for _ in range(4):
+        env.step(0)
+    twin = clone(env, method=method)
+    logs = []
+    for each in (env, twin):
+        while not each.step(0)[2]:
+            pass
+        logs.append(each.unwrapped.call(lambda view: view.unwrapped.simulation.log))
+        each.close()
+    assert logs[0] == logs[1]
+    assert len(set(logs[0])) > 1
+
+
 def test_a_new_episode_has_no_incumbent():
     env = one_agent()
     planner = patient()

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,30 +19,32 @@ pytest.importorskip("openai")
 
 COLUMNS = ["mean", "difference", "difference_low", "difference_high", "fallbacks"]
 
+OPTIONS = {"seeds": range(100, 104), "max_steps": 20, "skip_forced": True}
+
 AGENT = "dispatcher_0"
 
 PAGE = (Path(__file__).parents[2] / "docs/seats.md").read_text(encoding="utf-8")
 
 LIES = {
-    "none": lambda label, other: says(json.dumps({"action": label})),
-    "fence": lambda label, other: says(
+    "none": lambda label, other, *more: says(json.dumps({"action": label})),
+    "fence": lambda label, other, *more: says(
         f"Sure!\n```json\n{json.dumps({'why': f'not {other}', 'action': label})}\n```"
     ),
-    "words": lambda label, other: says("I'm sorry, but I can't help with that."),
-    "masked": lambda label, other: says('{"action": 7}'),
-    "reasoning": lambda label, other: says(f"<think>{other}? Too long.</think>\n{label}"),
-    "both": lambda label, other: says(f"Either {label}, or {other}."),
-    "empty": lambda label, other: says(""),
-    "cut off": lambda label, other: says(f'{{"action": "{label}', finish="length"),
-    "parts": lambda label, other: says(
+    "words": lambda label, other, *more: says("I'm sorry, but I can't help with that."),
+    "masked": lambda label, other, *more: says(json.dumps({"action": len(more) + 2})),
+    "reasoning": lambda label, other, *more: says(f"<think>{other}? Too long.</think>\n{label}"),
+    "both": lambda label, other, *more: says(f"Either {label}, or {other}."),
+    "empty": lambda label, other, *more: says(""),
+    "cut off": lambda label, other, *more: says(f'{{"action": "{label}', finish="length"),
+    "parts": lambda label, other, *more: says(
         [{"type": "text", "text": label[:5]}, {"type": "text", "text": label[5:]}]
     ),
-    "500": lambda label, other: fails(500, "out of memory"),
-    "schema": lambda label, other: fails(400, "guided decoding is off on this deployment"),
-    "late": lambda label, other: 9.0,
-    "number": lambda label, other: says("42"),
+    "500": lambda label, other, *more: fails(500, "out of memory"),
+    "schema": lambda label, other, *more: fails(400, "guided decoding is off on this deployment"),
+    "late": lambda label, other, *more: 9.0,
+    "number": lambda label, other, *more: says("42"),
 }
-"""The first one is no lie. A label is meant, and another one said."""
+"""Answers that mean the first label. The first answer is no lie."""
 
 KINDS = {
     **dict.fromkeys(["words", "masked", "both", "number"], "illegal"),
@@ -61,11 +64,11 @@ def answer(request):
     """Mean the most urgent job, and lie in a way that depends on the decision alone."""
     question = request["messages"][-1]["content"]
     labels = re.findall(r"^- (job .*, due in (.*))$", question, re.MULTILINE)
-    (meant, _), *others = sorted(labels, key=lambda label: float(label[1]))
+    urgent = [label for label, due in sorted(labels, key=lambda pair: float(pair[1]))]
     lie = lie_at(int(re.search(r"\(decision (\d+)", question)[1]))
     if lie == "schema" and "response_format" not in request:
         lie = "none"
-    return LIES[lie](meant, others[0][0] if others else "job 9: none")
+    return LIES[lie](*urgent)
 
 
 def compared(address, path, trained):
@@ -77,7 +80,7 @@ def compared(address, path, trained):
         "trained": trained,
     }
     contenders = {"rule": {}} | {name: {AGENT: policy} for name, policy in policies.items()}
-    return evaluate(MySimulation, contenders, seeds=range(3), max_steps=26, baseline="rule")
+    return evaluate(MySimulation, contenders, baseline="rule", **OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +98,7 @@ def runs(tmp_path_factory):
 
 def test_a_table_with_a_liar_is_repeated_without_a_request(runs):
     (first, second), requests, lines = runs
-    assert requests[0] >= len(lines) == 3 * 26
+    assert requests[0] >= len(lines) == 4 * 20
     assert requests[1] == requests[0]
     assert_frame_equal(second.frame, first.frame, check_exact=True)
     assert_frame_equal(second.summary(), first.summary(), check_exact=True)
@@ -113,12 +116,12 @@ def test_each_lie_is_understood_or_the_rule_answers(runs):
 
 
 def test_the_table_is_the_one_of_the_page(runs):
-    (found, _), _, _ = runs
+    (found, _), _, lines = runs
     seat = found.seats.set_index("contender").loc["language model"]
-    kinds = {kind: seat[kind] for kind in ("illegal", "failed", "http", "late")}
-    assert kinds == {"illegal": 24, "failed": 12, "http": 6, "late": 6}
-    assert (seat["agent"], seat["asked"], seat["fallbacks"]) == (AGENT, 78, 48)
-    assert found.summary()["note"]["language model"] == "62% of decisions by a fallback"
-    table = found.summary()[COLUMNS]
-    for line in table.round(2).to_string().splitlines():
+    kinds = Counter(KINDS[lie] for line in lines if (lie := lie_at(line["number"])) in KINDS)
+    assert {kind: seat[kind] for kind in kinds} == kinds
+    assert seat["fallbacks"] == kinds.total()
+    table = found.summary()[COLUMNS].round(2).to_string()
+    seats = found.seats[["contender", "agent", "decisions", "asked", "fallbacks"]]
+    for line in [*table.splitlines(), *seats.to_string(index=False).splitlines()]:
         assert line.rstrip() in PAGE.splitlines()

@@ -1,15 +1,18 @@
 """Templates: the files of the command line run in place, and impossible ones are refused."""
 
 import ast
+import re
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from simenv_marl import simulate
+from simenv_marl import aec_env, simulate
 from simenv_marl.__main__ import main
+from simenv_marl.seats import describe
 from simenv_marl.testing.fingerprint import differences, fingerprint
 from simenv_marl.testing.templates import KINDS
 from tests.processes import python
@@ -132,6 +135,21 @@ def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
         simulate(template.MySimulation, {}, seed=7),
     ):
         assert differences(fingerprint("simulation", other), fingerprint("simulation", plain)) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_template_names_observations_and_actions(kind):
+    template = import_module(f"simenv_marl.testing.templates.{kind}")
+    points = {
+        point: replace(step, display_mapping=None)
+        for point, step in template.MySimulation.points.items()
+    }
+    env = begun(aec_env(template.MySimulation, points), 7)
+    found = describe(env, as_json=True)
+    names = [*found["observation"], *found["actions"]["enum"]]
+    assert len(found["observation"]) == env.last()[0].size
+    assert [name for name in names if not re.search("[a-z]{3}", name)] == []
+    env.close()
 
 
 def test_agents_of_the_mesa_template_are_born_and_die():

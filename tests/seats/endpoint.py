@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from contextlib import contextmanager
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
@@ -38,9 +39,7 @@ class _Handler(BaseHTTPRequestHandler):
         request["key"] = self.headers.get("Authorization")
         request["port"] = self.client_address[1]
         self.server.requests.append(request)
-        answer = (
-            self.server.answers.pop(0) if len(self.server.answers) > 1 else self.server.answers[0]
-        )
+        answer = self.server.answer(request)
         if isinstance(answer, float):
             time.sleep(answer)
             answer = says('{"action": "open"}')
@@ -60,12 +59,20 @@ class _Handler(BaseHTTPRequestHandler):
         pass
 
 
+def _in_turn(answers, request):
+    return answers.pop(0) if len(answers) > 1 else answers[0]
+
+
 @contextmanager
 def endpoint(answers):
-    """Serve one answer per request, and repeat the last one; a number of seconds is a delay."""
+    """Serve one answer per request, and repeat the last one; a number of seconds is a delay.
+
+    ``answers`` may be a callable of the request.
+    """
     server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     server.daemon_threads = True
-    server.answers, server.requests = [*answers], []
+    server.requests = []
+    server.answer = answers if callable(answers) else partial(_in_turn, [*answers])
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:

@@ -11,6 +11,7 @@ import mesa
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from mesa.discrete_space import Cell, CellAgent, OrthogonalVonNeumannGrid
+from numpy.typing import NDArray
 
 from simenv_marl import (
     SteppedSimulation,
@@ -83,17 +84,27 @@ class MyModel(mesa.Model):
 # -- 2. The decision: each agent's observation, actions and reward --------------------------------
 
 
-def observe(rabbit: Rabbit) -> list[list[float]]:
-    """Return a row for each cell in reach: the grass, and the number of other rabbits there."""
-    rows = []
+def observe(rabbit: Rabbit) -> list[float]:
+    """Return two numbers for each cell in reach: the grass and the other rabbits there."""
+    numbers = []
     for place in rabbit.places():
         others = len(place.agents) - (place is rabbit.cell)
-        rows.append([rabbit.model.grass[place.coordinate], min(others, 5)])
-    return rows
+        numbers += [rabbit.model.grass[place.coordinate], min(others, 5)]
+    return numbers
+
+
+def name_places(rabbit: Rabbit) -> list[str]:
+    """Return the position of each cell in reach, its grass and the other rabbits there."""
+    numbers = observe(rabbit)
+    parts = zip(rabbit.places(), numbers[::2], numbers[1::2], strict=True)
+    return [
+        f"{place.coordinate}: grass {grass:.2f}, other rabbits {others:g}"
+        for place, grass, others in parts
+    ]
 
 
 move = make_step(
-    observation_space=Box(0, 5, (5, 2), np.float32),
+    observation_space=Box(0, 5, (10,), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(5),
     choices=Rabbit.places,  # the action is an index
@@ -102,9 +113,11 @@ move = make_step(
     removed_by="mesa.agent.Agent.remove",  # ... to its death
     # For people and language models:
     question="Where does the rabbit go?",
-    action_labels=lambda rabbit: [
-        f"{place.coordinate}: grass {rabbit.model.grass[place.coordinate]:.2f}"
-        for place in rabbit.places()
+    action_labels=name_places,
+    observation_labels=[
+        f"{place}: {part}"
+        for place in ("here", "cell 1", "cell 2", "cell 3", "cell 4")
+        for part in ("grass", "other rabbits")
     ],
     display_mapping=lambda rabbit: {
         "energy": f"{rabbit.energy:.2f}",
@@ -138,7 +151,12 @@ def env() -> SimulationAECEnv:
 
 def score_places(weights: Any) -> Any:
     """Make a policy for one observation or many: it takes the place with the highest score."""
-    return lambda rows: (rows @ weights).argmax(-1)
+
+    def choose(observations: NDArray[np.float32]) -> Any:
+        rows = observations.reshape(*observations.shape[:-1], 5, 2)
+        return (rows @ weights).argmax(-1)
+
+    return choose
 
 
 def train(candidates: int, meadows: int) -> Any:

@@ -73,15 +73,15 @@ class MyModel:
 
 
 def observe(shop: MyModel) -> NDArray[np.float32]:
-    """Return a row for each of eight jobs: whether it exists, its minutes, and the time left."""
+    """Return three numbers for each of eight jobs: that it waits, its minutes, the time left."""
     rows = np.zeros((8, 3), np.float32)
     for row, job in zip(rows, shop.waiting, strict=False):
         row[:] = 1, job.minutes / 20, (job.due - shop.clock.now - job.minutes) / 60
-    return rows.clip(-10, 10)
+    return rows.clip(-10, 10).ravel()
 
 
 dispatch = make_step(
-    observation_space=Box(-10, 10, (8, 3), np.float32),
+    observation_space=Box(-10, 10, (24,), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(8),
     choices=lambda shop: shop.waiting[:8],  # the action is an index
@@ -93,6 +93,11 @@ dispatch = make_step(
         action: f"job {action + 1}: {job.minutes:g} minutes, due in {job.due - shop.clock.now:.0f}"
         for action, job in enumerate(shop.waiting[:8])
     },
+    observation_labels=[
+        f"job {job}: {part}"
+        for job in range(1, 9)
+        for part in ("it waits", "minutes / 20", "hours left")
+    ],
     display_mapping=lambda shop: {
         "minutes since the morning": f"{shop.clock.now:.0f}",
         "waiting jobs": len(shop.waiting),
@@ -136,7 +141,12 @@ def env() -> SimulationEnv:
 
 def score_jobs(weights: Any) -> Any:
     """Make a policy for one observation or many: it takes the job with the highest score."""
-    return lambda rows: np.where(rows[..., 0] > 0, rows[..., 1:] @ weights, -np.inf).argmax(-1)
+
+    def choose(observations: NDArray[np.float32]) -> Any:
+        rows = observations.reshape(*observations.shape[:-1], 8, 3)
+        return np.where(rows[..., 0] > 0, rows[..., 1:] @ weights, -np.inf).argmax(-1)
+
+    return choose
 
 
 def train(candidates: int, days: int) -> Any:

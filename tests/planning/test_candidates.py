@@ -163,6 +163,13 @@ def test_a_metric_is_read_in_every_view(make):
         assert told.returns.tolist() == alone.returns.tolist()
 
 
+def test_branches_do_not_warn_of_lost_actions():
+    env = begun(joint_env(Works, points()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        action_values(env, [lambda seen: {"machine": 4, "watchman": 0}], hold=None, method="replay")
+
+
 def test_a_metric_is_interpolated_at_a_horizon():
     env = one_agent()
     given = {"futures": 3, "horizon_by": "time", "method": "replay"}

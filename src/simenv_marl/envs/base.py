@@ -347,7 +347,7 @@ class View:
     def warn_of_losses(self, episode: EpisodeState) -> None:
         """Warn once if an episode in rounds has used fewer than nine in ten actions."""
         problem = "" if episode.round is None else episode.round.explain_losses()
-        if problem and not self._has_warned_of_losses:
+        if problem and not (self._has_warned_of_losses or episode.is_branch):
             self._has_warned_of_losses = True
             warn_user(problem)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from ..core import Policy
 from ..errors import OptionValueError, short_repr
@@ -49,12 +49,24 @@ def is_policy(candidate: object) -> bool:
     return candidate is RULE or callable(candidate) or is_deployed
 
 
-class Hold(Protocol):
-    """How long candidates decide, as planners have it among their attributes."""
+Metric: TypeAlias = Callable[[Any], float]
+"""Returns how well a simulation stands. Larger is better."""
 
-    hold: float | None
-    hold_by: str
-    every: int
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class Task:
+    """How long candidates decide, and what their rollouts measure: see ``RolloutPolicy``."""
+
+    base: Policy = RULE
+    hold: float | None = 1
+    hold_by: str = "decision"
+    every: int = 1
+    horizon: float | None = None
+    horizon_by: str = "decision"
+    terminal_value: Callable[[Any], float] | None = None
+    metric: Metric | None = None
+    discount: float = 1.0
+    discount_by: str = "decision"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,17 +83,17 @@ class Course:
     decisions: int = 0
     time: float = 0.0
 
-    def goes_on(self, planner: Hold, decisions: int, time: float) -> bool:
+    def goes_on(self, task: Task, decisions: int, time: float) -> bool:
         """Return whether it still decides, some more decisions and some time later."""
-        if planner.hold is None or isinstance(self.candidate, First):
+        if task.hold is None or isinstance(self.candidate, First):
             return True
         held: dict[str, float] = {
             "decision": self.decisions + decisions,
             "time": self.time + time,
         }
         # A new one is held as ``hold`` says. ``every`` counts the decisions of the user's episode.
-        is_due = self.decisions > 0 and held["decision"] < planner.every
-        return is_due or held[planner.hold_by] < planner.hold
+        is_due = self.decisions > 0 and held["decision"] < task.every
+        return is_due or held[task.hold_by] < task.hold
 
     def part(self, decisions: int) -> Candidate:
         """Return its part for a later decision: an action, a policy or ``RULE``."""
@@ -121,11 +133,11 @@ class Choice:
         """Its part for the latest decision."""
         return Course(self.candidate, self.decisions).part(0)
 
-    def resume(self, planner: Hold, time: float) -> Course:
+    def resume(self, task: Task, time: float) -> Course:
         """Return the candidate as it goes on at a time, or anew where nothing of it is left."""
         course = Course(self.candidate, self.decisions, time - self.start)
-        is_endless = planner.hold is None and not isinstance(self.candidate, First)
-        if self.candidate is RULE or is_endless or not course.goes_on(planner, 0, 0.0):
+        is_endless = task.hold is None and not isinstance(self.candidate, First)
+        if self.candidate is RULE or is_endless or not course.goes_on(task, 0, 0.0):
             return Course(self.candidate)
         return course
 

@@ -44,7 +44,7 @@ from ..errors import (
     short_repr,
 )
 from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel, asks_for
-from .candidates import Candidate, First, Propose, is_policy
+from .candidates import Candidate, First, Metric, Propose, is_policy
 
 Environment: TypeAlias = (
     Env[Observation, Action]
@@ -52,9 +52,6 @@ Environment: TypeAlias = (
     | ParallelEnv[str, Observation, Action]
 )
 """An environment of one simulation, in any view, with or without wrappers."""
-
-Metric: TypeAlias = Callable[[Any], float]
-"""Returns how well a simulation stands. Larger is better."""
 
 Policies: TypeAlias = dict[str | Sentinel, Policy]
 """Policies by agent, which are asked as those of a planner's branch."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, Final, Protocol
+from typing import Final
 from zlib import crc32
 
-from ..core import Agent, Policy
+from ..core import Agent
 from ..errors import annotate, short_repr
-from .candidates import Course, Hold
-from .player import Environment, Metric, Player, number_of
+from .candidates import Course, Task
+from .player import Environment, Player, number_of
 from .players import player_of
 
 Indices = tuple[int, ...]
@@ -48,18 +48,6 @@ class Rollout:
 
 BEGIN: Final = Rollout()
 """A rollout before its first decision."""
-
-
-class Task(Hold, Protocol):
-    """What is measured in rollouts, as planners have it among their attributes."""
-
-    base: Policy
-    horizon: float | None
-    horizon_by: str
-    terminal_value: Callable[[Any], float] | None
-    metric: Metric | None
-    discount: float
-    discount_by: str
 
 
 def try_out(

@@ -20,8 +20,8 @@ from ..core import Info, Policy, branch, checked_seed, is_seed, same
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
-from .candidates import Candidate, Choice, Course, First, Propose, is_policy
-from .player import Environment, Metric, Player, is_number
+from .candidates import Candidate, Choice, Course, First, Metric, Propose, Task, is_policy
+from .player import Environment, Player, is_number
 from .players import player_of
 from .rollout import Indices, Rollout, Try, try_out
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
@@ -403,7 +403,7 @@ def _is_same(one: Candidate, other: Candidate) -> bool:
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class RolloutPolicy:
+class RolloutPolicy(Task):
     """A policy that looks one decision ahead: it takes the candidate that is best in branches.
 
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds.
@@ -437,17 +437,7 @@ class RolloutPolicy:
     """
 
     actions: Iterable[Candidate] | Propose | None = field(default=None, kw_only=False)
-    base: Policy = RULE
-    hold: float | None = 1
-    hold_by: str = "decision"
-    every: int = 1
     futures: int = 16
-    horizon: float | None = None
-    horizon_by: str = "decision"
-    terminal_value: Callable[[Any], float] | None = None
-    metric: Metric | None = None
-    discount: float = 1.0
-    discount_by: str = "decision"
     seed: int | None = None
     method: str | None = None
     time_limit: float = 600.0

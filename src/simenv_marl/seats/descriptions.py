@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf, isfinite
 from typing import Any, Final, TypeAlias
 
@@ -226,11 +226,15 @@ def action_schema(decision: Decision) -> Schema:
     if isinstance(space, Discrete) and isinstance(labels, Mapping):
         legal = [labels[action] for action in legal_actions(space, decision.mask)]
         return {"type": "string", "enum": legal}
-    return _schema(space, labels)
+    return schema_of(space, labels)
 
 
-def _schema(space: Space[Any], labels: Labels) -> Schema:
-    parts: Iterable[Schema]
+def schema_of(space: Space[Any], labels: Labels) -> Schema:
+    """Return the JSON schema of a space, with the labels of its components.
+
+    Raises:
+        ViewError: A part of the space has no names or numbers.
+    """
     match space:
         case Discrete():
             return _range(int(space.start), int(space.start + space.n - 1))
@@ -248,25 +252,40 @@ def _schema(space: Space[Any], labels: Labels) -> Schema:
             if labels and labels != UNLABELLED_NUMBER:
                 schema["description"] = labels[0]
             return schema
-        case Dict():
-            labels = [str(label_of_part(labels, key)) for key in space]
-            parts = [_schema(part, None) for part in space.values()]
-        case Tuple() | MultiDiscrete(shape=(_,)):
-            parts = [_schema(space[place], None) for place in range(len(space))]
-        case Box(shape=(_,)):
-            parts = map(_range, _numbers(space.low), _numbers(space.high))
-        case MultiBinary(shape=(size,)):
-            parts = [_range(0, 1)] * size
+        case Box(shape=(_, _, *_)):
+            parts = []  # JSON has no names for the components of matrices
         case _:
-            raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
-    parts = list(parts)
-    names = labels or list(map(str, range(len(parts))))
+            parts = components_of(space, labels)
+    if not parts:
+        raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
+    properties = {label: schema_of(part, None) for _, label, part in parts}
     return {
         "type": "object",
-        "properties": dict(zip(names, parts, strict=True)),
-        "required": list(names),
+        "properties": properties,
+        "required": [*properties],
         "additionalProperties": False,
     }
+
+
+def components_of(space: Space[Any], labels: Labels) -> list[tuple[Any, str, Space[Any]]]:
+    """Return the components of a space: key, label and space of each. Other spaces have none."""
+    parts: Sequence[Space[Any]]
+    match space:
+        case Dict():
+            return [(key, str(label_of_part(labels, key)), part) for key, part in space.items()]
+        case Tuple():
+            parts = space.spaces
+        case MultiDiscrete(shape=(size,)):
+            parts = [space[place] for place in range(size)]
+        case MultiBinary(shape=(size,)):
+            parts = [Discrete(2)] * size
+        case Box(shape=(_, *shape)):
+            bounds = zip(space.low, space.high, strict=True)
+            parts = [Box(low, high, shape, space.dtype) for low, high in bounds]
+        case _:
+            return []
+    numbers = range(len(parts))
+    return [*zip(numbers, labels or map(str, numbers), parts, strict=True)]
 
 
 def _range(low: float, high: float) -> Schema:

@@ -15,7 +15,7 @@ from ... import clone
 from ...envs import SimulationAECEnv
 from ...errors import BranchError, describe_error
 from ...simulation import Action
-from ..descriptions import at_decision
+from ..descriptions import at_decision, labelled
 from .deciders import Deciders
 from .forms import (
     MOST_CANDIDATES,
@@ -304,7 +304,7 @@ class Futures(Exploration):
         info = twin.infos[self._agent]
         time = info.get("time", before[0]) if self._by_time else before[0] + 1
         if not self.pending["displayed"]:
-            situation = entries_of(twin.observe(self._agent))
+            situation = entries_of(labelled(twin.observe(self._agent)))
         elif ended:
             return [time, before[1] + reward, *before[2:]]
         else:

@@ -283,7 +283,7 @@ class Host:
     def _redo(self, seat: str) -> None:
         game = self.game
         end = len(game.timeline)
-        if game.previous is not None and not any("action" in row for row in game.timeline):
+        if game.can_go_back:
             self.abandon()
             game.go_back()
             self._stop_rule()
@@ -412,7 +412,7 @@ class Host:
         checkpoint = game.checkpoints.get(game.turn)
         env = game.env if checkpoint is None else checkpoint.env
         if game.now is not None:
-            pending = game.now | {"turn": game.turn, "moment": game.moment}
+            pending = game.now | {"moment": game.moment}
             return Futures(env, game.deciders, pending, self._horizon, game.seed)
         if game.over not in ENDS:
             return None
@@ -475,7 +475,7 @@ class Host:
             "picture": self._picture,
             "notice": game.notice,
             "event": self.event,
-            "back": game.previous is not None and not decided,
+            "back": game.can_go_back,
         }
 
     def _pending(self) -> Message | None:

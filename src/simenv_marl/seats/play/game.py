@@ -148,6 +148,11 @@ class Game:
         """Return whether the agent's seat is for a person."""
         return agent in self.seats if self.seats else not self.agents.get(agent)
 
+    def turns_of(self, seat: str) -> list[int]:
+        """Return the turns of a seat; for "", the facilitator, those of all people."""
+        is_own = (lambda agent: agent == seat) if seat else self.plays
+        return [row["turn"] for row in self.timeline if is_own(row["agent"])]
+
     def close(self) -> None:
         """Close all environments."""
         self.forget(-1)
@@ -304,7 +309,7 @@ class Game:
     def jump(self, turn: int) -> None:
         """Go to the end, or to the latest decision of a person up to a turn."""
         before = self.turn
-        stops = [row["turn"] for row in self.timeline if self.plays(row["agent"])]
+        stops = self.turns_of("")
         stops += [len(self.timeline)] if "action" in self.timeline[-1] else []
         earlier = [stop for stop in stops if stop <= turn]
         self._go_to(max(earlier, default=min(stops, default=0)))

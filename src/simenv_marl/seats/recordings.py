@@ -6,10 +6,10 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from uuid import uuid4
 
 import numpy as np
@@ -98,20 +98,8 @@ class Outcome:
         return (self.action, self.extras) if self.extras else self.action
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """An action as JSON in a recording of an older version."""
-
-    json: Any
-
-
-class _Line(NamedTuple):
-    """A line of a recording; the action of its outcome is JSON."""
-
-    question: Question
-    outcome: Outcome
-    run: str | None
-    """The recording that has written the line."""
+Entry = dict[str, Any]
+"""A line of a recording: its question and its outcome as JSON, and the run that has written it."""
 
 
 class Recording:
@@ -134,11 +122,11 @@ class Recording:
             )
         self._file = Lines(path)
         self._run = uuid4().hex[:12]
-        self._lines: dict[tuple[int, str], list[_Line]] | None = None
+        self._entries: dict[tuple[int, str], list[Entry]] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Return the state without the lines, because the file has them, too."""
-        return {**vars(self), "_lines": None}
+        """Return the state without the entries, because the file has them, too."""
+        return {**vars(self), "_entries": None}
 
     def find(self, question: Question, decision: Decision) -> Outcome | None:
         """Return the recorded outcome of a decision. None: it has to be decided.
@@ -147,70 +135,68 @@ class Recording:
             OptionValueError: Another policy has answered it, or the file has only answers to other
                 decisions of this agent in this episode.
         """
-        lines = self._lines_of(question)
         given = self._given(decision)
         others = []
-        for place, line in enumerate(lines):
+        for place, entry in enumerate(self._entries_of(question)):
             if place in given:
                 continue
-            asked = line.question
-            is_same = asked.observation == question.observation
-            if is_same and asked.legal in (None, question.legal):
-                self._check_policy(question, asked)
+            is_same = entry["observation"] == question.observation
+            if is_same and entry.get("legal") in (None, question.legal):
+                self._check_policy(question, entry)
                 given.add(place)
-                return _decoded(line.outcome, decision.action_space)
-            if line.run != self._run:
-                others.append(asked)
+                return _outcome_in(entry, decision.action_space)
+            if entry.get("run") != self._run:
+                others.append(entry["observation"])
         if others:
             raise self._refusal(question, others)
         return None
 
     def write(self, question: Question, outcome: Outcome, decision: Decision) -> None:
         """Append the outcome of a decision."""
-        action = None if outcome.action is RULE else encode(decision.action_space, outcome.action)
-        extras = {name: _encode_part(part) for name, part in outcome.extras.items()}
-        outcome = replace(outcome, action=action, extras=extras)
         entry = vars(question) | vars(outcome) | {"run": self._run}
-        empty = [name for name in ("policy", "extras", "why", "counts") if not entry[name]]
-        self._file.append({name: entry[name] for name in entry if name not in empty})
-        lines = self._lines_of(question)
-        self._given(decision).add(len(lines))
-        lines.append(_Line(question, outcome, self._run))
+        is_rule = outcome.action is RULE
+        entry["action"] = None if is_rule else encode(decision.action_space, outcome.action)
+        entry["extras"] = {name: _encode_part(part) for name, part in outcome.extras.items()}
+        optional = ("policy", "extras", "why", "counts")
+        entry = {name: part for name, part in entry.items() if part or name not in optional}
+        self._file.append(entry)
+        entries = self._entries_of(question)
+        self._given(decision).add(len(entries))
+        entries.append(entry)
 
     def _given(self, decision: Decision) -> set[int]:
         """Return the places of the lines that this agent has been given in this episode."""
         given: set[int] = decision.memory.setdefault(self._run, set())
         return given
 
-    def _lines_of(self, question: Question) -> list[_Line]:
-        """Return the lines of the agent and the seed of a decision."""
-        if self._lines is None:
-            self._lines = defaultdict(list)
+    def _entries_of(self, question: Question) -> list[Entry]:
+        """Return the entries of the agent and the seed of a decision."""
+        if self._entries is None:
+            self._entries = defaultdict(list)
             for number, entry in self._file.read() if self.path.exists() else ():
                 try:
-                    line = _line_of(entry)
+                    seed, agent, _ = (entry[name] for name in ("seed", "agent", "observation"))
+                    self._entries[seed, agent].append(entry)
                 except (TypeError, LookupError):
                     warn_user(f"line {number} of {self.path} is no answer, and is left out")
-                    continue
-                self._lines[line.question.seed, line.question.agent].append(line)
-        return self._lines[question.seed, question.agent]
+        return self._entries[question.seed, question.agent]
 
-    def _check_policy(self, question: Question, asked: Question) -> None:
-        differing = [
-            name for name in asked.policy if asked.policy[name] != question.policy.get(name)
-        ]
-        for name in differing:
-            raise OptionValueError(
-                f"{self.path} has the answers of another policy: its {name} is"
-                f" {asked.policy[name]!r}, and now {question.policy.get(name)!r}; record in another"
-                " file"
-            )
+    def _check_policy(self, question: Question, entry: Entry) -> None:
+        for name, recorded in entry.get("policy", {}).items():
+            present = question.policy.get(name)
+            if recorded != present:
+                raise OptionValueError(
+                    f"{self.path} has the answers of another policy: its {name} is {recorded!r},"
+                    f" and now {present!r}; record in another file"
+                )
 
-    def _refusal(self, question: Question, others: list[Question]) -> OptionValueError:
-        """Return the error that says how a decision differs from the recorded ones."""
-        problem = "its observation"
-        if question.observation in [other.observation for other in others]:
-            problem = "its legal actions"
+    def _refusal(self, question: Question, others: list[str]) -> OptionValueError:
+        """Return the error that says how a decision differs from the recorded ones.
+
+        ``others``: the observations of those that were not asked.
+        """
+        is_seen = question.observation in others
+        problem = "its legal actions" if is_seen else "its observation"
         return OptionValueError(
             f"{self.path} has no answer to decision {question.number} of {question.agent!r} in the"
             f" episode of seed {question.seed}, but {len(others)} to others that are not asked:"
@@ -249,29 +235,15 @@ def question_of(decision: Decision, policy: object) -> Question:
     )
 
 
-def _line_of(entry: Mapping[str, Any]) -> _Line:
-    """Return the line of an entry, also of one of an older version."""
-    question = Question(**_parts(entry, Question))
-    if "answer" in entry:  # an older version
+def _outcome_in(entry: Entry, space: Space[Any]) -> Outcome:
+    """Return the outcome of an entry, also of one of an older version."""
+    if "answer" in entry:
         sample = entry["answer"]
-        return _Line(question, Outcome(None if sample is None else _Sample(sample)), None)
-    outcome = Outcome(**_parts(entry, Outcome))
-    return _Line(question, outcome, entry["run"])
-
-
-def _parts(entry: Mapping[str, Any], kind: type[Question | Outcome]) -> dict[str, Any]:
-    return {part.name: entry[part.name] for part in fields(kind) if part.name in entry}
-
-
-def _decoded(outcome: Outcome, space: Space[Any]) -> Outcome:
-    action = outcome.action
-    extras = {name: _decode_part(part) for name, part in outcome.extras.items()}
-    outcome = replace(outcome, extras=extras)
-    if action is None:
-        return replace(outcome, action=RULE)
-    if isinstance(action, _Sample):
-        return replace(outcome, action=space.from_jsonable(action.json)[0])
-    return replace(outcome, action=decode(space, action))
+        return Outcome(RULE if sample is None else space.from_jsonable(sample)[0])
+    action = RULE if entry["action"] is None else decode(space, entry["action"])
+    extras = {name: _decode_part(part) for name, part in entry.get("extras", {}).items()}
+    others = {name: entry[name] for name in ("by", "why", "counts") if name in entry}
+    return Outcome(action, extras, **others)
 
 
 # -- actions as JSON ------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from math import inf, isfinite
+from math import isfinite
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -189,11 +189,11 @@ def legal_lines(decision: Decision) -> list[str]:
         case {"enum": labels}:
             return [f"- {label}" for label in labels]
         case {"properties": parts}:
-            lines = [f"- {name}: {_limits(part)}" for name, part in parts.items()]
+            lines = [f"- {name}: {limits_of(part)}" for name, part in parts.items()]
         case {"description": label}:
-            lines = [f"- {label}: {_limits(schema)}"]
+            lines = [f"- {label}: {limits_of(schema)}"]
         case {"type": _}:
-            lines = [f"- {_limits(schema)}"]
+            lines = [f"- {limits_of(schema)}"]
         case _:
             lines = [f"- {decision.action_space}"]
     if decision.mask is not None:
@@ -201,18 +201,22 @@ def legal_lines(decision: Decision) -> list[str]:
     return lines
 
 
-def _limits(schema: Schema) -> str:
-    if "properties" in schema:
-        parts = schema["properties"].items()
-        texts = [f"{name}: {_limits(part)}" for name, part in parts]
-        return f"({', '.join(texts)})"
-    if schema["type"] == "string":
-        characters = schema["pattern"][2:-3]
-        return f"{schema['minLength']} to {schema['maxLength']} characters of {characters}"
-    noun = "an integer" if schema["type"] == "integer" else "a number"
-    low = _value_text(schema.get("minimum", -inf))
-    high = _value_text(schema.get("maximum", inf))
-    return f"{noun} from {low} to {high}"
+def limits_of(schema: Schema) -> str:
+    """Return the values that a JSON schema allows, in words."""
+    noun = "a whole number" if schema.get("type") == "integer" else "a number"
+    match schema:
+        case {"properties": parts}:
+            texts = [f"{name}: {limits_of(part)}" for name, part in parts.items()]
+            return f"({', '.join(texts)})"
+        case {"minLength": least, "maxLength": most, "pattern": pattern}:
+            return f"{least} to {most} characters of {pattern[2:-3]}"
+        case {"minimum": low, "maximum": high}:
+            return f"{noun} from {_value_text(low)} to {_value_text(high)}"
+        case {"minimum": low}:
+            return f"{noun} of at least {_value_text(low)}"
+        case {"maximum": high}:
+            return f"{noun} of at most {_value_text(high)}"
+    return noun
 
 
 def action_schema(decision: Decision) -> Schema:

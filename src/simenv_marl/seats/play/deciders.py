@@ -64,10 +64,6 @@ class Deciders:
             settings = {**options, "policies": policies, "max_steps": None}
             PLANS[self._token] = plan_of(simulation, points, settings, mode=Mode.SIMULATE)
 
-    def __bool__(self) -> bool:
-        """Return whether there are policies."""
-        return bool(self._names)
-
     def name_for(self, agent: str, point: str) -> str:
         """Return the name of the policy that decides for an agent of a point; "" for none."""
         keys = agent, point, EVERYONE
@@ -81,7 +77,7 @@ class Deciders:
             future: Whether a future is tried out, in place of policies that wait by their
                 fallbacks.
         """
-        if not self:
+        if not self._names:
             return None
         return env.call(_answer, self._token, future)
 
@@ -94,16 +90,15 @@ def _answer(
     episode: Any = view.episode
     agent: Agent = episode.deciding
     plan = PLANS[token]
-    hook = agent.point.hook
-    points = [point for point in plan.points if point.hook is hook]
+    points = [point for point in plan.points if point.hook is agent.point.hook]
     policy: Any = plan.policy_of(agent.name, points[0]) if points else RULE
     if policy is RULE:
         return None
     policy = two_arguments(policy)
-    observation = agent.hand_out()
     if isinstance(policy, AskingPolicy) and not future:
-        action = policy.answer(UserEpisode(episode), agent, observation, agent.info)
-    elif isinstance(policy, EpisodePolicy):
+        episode = UserEpisode(episode)
+    observation = agent.hand_out()
+    if isinstance(policy, EpisodePolicy):
         action = policy.answer(episode, agent, observation, agent.info)
     else:
         action = policy(observation, agent.info)

@@ -23,10 +23,10 @@ from ...simulation import RULE, Action
 from ..answers import MISFITS, to_action
 from ..descriptions import (
     JSON,
-    Schema,
     components_of,
     label_of_part,
     legal_actions,
+    limits_of,
     schema_of,
     situation,
 )
@@ -175,26 +175,12 @@ def _input_of(
             texts = [shown(label_of_part(labels, action)) for action in legal]
             pairs = zip(legal, texts, strict=True)
             return {"options": [{"action": action, "text": text} for action, text in pairs]}
-        case Discrete() if mask is not None:
-            pass
-        case Discrete() | Box(shape=()) | Text():
+        case Text():
+            return {"maxLength": space.max_length, "hint": f"at most {space.max_length} characters"}
+        case Discrete() | Box(shape=()) if mask is None:
             schema = schema_of(space, None)
-            return schema | {"hint": _hint_of(schema)}
+            return schema | {"hint": limits_of(schema)}
     return {"json": short_repr(space)}
-
-
-def _hint_of(schema: Schema) -> str:
-    noun = "a whole number" if schema["type"] == "integer" else "a number"
-    match schema:
-        case {"maxLength": longest}:
-            return f"at most {longest} characters"
-        case {"minimum": low, "maximum": high}:
-            return f"{noun} from {shown(low)} to {shown(high)}"
-        case {"minimum": low}:
-            return f"{noun} of at least {shown(low)}"
-        case {"maximum": high}:
-            return f"{noun} of at most {shown(high)}"
-    return noun
 
 
 def words_of(form: Message, action: Action) -> str:

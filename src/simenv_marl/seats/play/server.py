@@ -189,14 +189,13 @@ class Table:
         """Check a message, and pass it on to the game; return the problem, or ""."""
         link = self.links[number]
         try:
-            message = json.loads(text, parse_constant=str, parse_float=_finite)
-            match message:
-                case {"do": "claim", "seat": str(seat)} if seat in self._owners.values():
+            match json.loads(text, parse_constant=str, parse_float=_finite):
+                case {"do": "claim", "seat": str(seat)} if seat and seat in self._owners.values():
                     if not self._is_open or seat in self._seats.values():
                         return f"{seat} needs the link of this seat: ask for it"
                     _send({"type": "link", "path": self._path(seat)}, link)
                     return ""
-                case {"key": str(key)}:
+                case {"key": str(key), **message}:
                     owner = self._owners.get(key)
                     parcel = pickle.dumps((number, owner, message))  # it may be too deep
                 case _:

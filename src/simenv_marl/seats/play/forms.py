@@ -195,17 +195,17 @@ def words_of(form: Message, action: Action) -> str:
 
 
 def complaint_about(form: Message, action: Action) -> Message:
-    """Say what is wrong with an illegal action, at its field. An empty dict: it is not known."""
+    """Say what is wrong with an illegal action, as ``text``. An empty dict: it is not known."""
     if "cards" in form:
         texts = _texts(form["cards"][:MOST_CANDIDATES])
         return {"text": f"Choose one of these answers: {texts} (not {short_repr(action)})."}
-    for place, field in enumerate(form["fields"]):
+    for field in form["fields"]:
         value = _value_at(action, field["path"])
         if not _fits(field, value):
             hint = f"Enter {field['hint']}" if "hint" in field else ""
             problem = hint or f"Choose one of {_texts(field['options'])}"
             given = "" if value in ("", None) else f", not {short_repr(value, 60)}"
-            return {"field": place, "text": f"{problem}{given}."}
+            return {"text": f"{problem}{given}."}
     return {}
 
 

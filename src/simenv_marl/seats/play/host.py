@@ -137,7 +137,6 @@ class Host:
         self._lock = Lock()
         self._horizon = Horizon()
         self._picture: Message | None = None
-        self._moment = -1
         self._stop()
 
     def _stop(self) -> None:
@@ -183,8 +182,7 @@ class Host:
         """
         if self.game.now is not None and self._seconds_left() == 0.0:
             self._tell({"type": "busy", "on": True})
-            self.abandon()
-            self.game.decide(None, "limit")
+            self._decide(None, "limit")
             return True
         if not connection.poll(timeout):
             return False
@@ -196,8 +194,7 @@ class Host:
             changed = self.handle(seat, message)
         except Exception as error:
             changed = not isinstance(error, ValueError)
-            complaint = error.complaint if isinstance(error, IllegalActionError) else {}
-            reply = {"type": "error", "text": message_of(error), **complaint}
+            reply = {"type": "error", "text": message_of(error)}
         self._tell(reply, number)
         return changed
 
@@ -263,7 +260,7 @@ class Host:
                 by_time = message.get("by") == "time"
                 self.abandon()
                 self._horizon = Horizon(by_time, length if by_time else min(int(length), 100))
-                self._moment = -1
+                self.exploring = None
             case _:
                 raise OptionValueError(f"the game cannot follow {short_repr(message)}")
         return True
@@ -278,11 +275,16 @@ class Host:
         return now
 
     def _check_action(self, action: Any, form: Message) -> None:
-        """Check an action as JSON, so that an illegal one does not end the exploration."""
+        """Check an action as JSON, so that an illegal one does not end the exploration.
+
+        Raises:
+            InvalidActionError: It is not legal, with a text for people.
+        """
         try:
             at_decision(self.game.env, "play", partial(check_legal, action))
         except InvalidActionError as error:
-            raise IllegalActionError(str(error), complaint_about(form, action)) from error
+            complaint = complaint_about(form, action).get("text")
+            raise InvalidActionError(complaint or str(error)) from error
 
     def _decide(self, action: Any, by: str) -> None:
         self.abandon()
@@ -343,15 +345,12 @@ class Host:
             if monotonic() > latest + PAUSE:
                 latest = monotonic()
                 yield self.snapshot()
-        if game.moment != self._moment:
+        if self.exploring is None or self.exploring.moment != game.moment:
             self.abandon()
-            self._moment = game.moment
-            self._picture = None
             if game.now is not None:
                 game.make_checkpoint()
                 self._start_clock()
-            if game.over in ENDS:
-                self._picture = picture_of(game.env)
+            self._picture = picture_of(game.env) if game.over in ENDS else None
             self.exploring = self._explore()
         yield self.snapshot()
         if self.exploring is None:
@@ -399,7 +398,6 @@ class Host:
             "title": self.rules.title,
             "time_unit": self.rules.time_unit,
             "tools": self.rules.tools,
-            "simulation": game.name,
             "seed": game.seed,
             "resumed": game.resumed,
             "seats": seats,
@@ -415,7 +413,6 @@ class Host:
             "views": self._views(),
             "courses": self._courses(seats) if game.over else {},
             "left": self._seconds_left(),
-            "limit": self.rules.limit,
             "late": late,
             "picture": self._picture,
             "notice": game.notice,
@@ -459,15 +456,6 @@ class Host:
             totals = [row["before"] for row in self.game.timeline if row["agent"] == agent]
             courses[agent] = [*totals, self.game.returns.get(agent, 0.0)]
         return courses
-
-
-class IllegalActionError(InvalidActionError):
-    """A person's action is not legal."""
-
-    def __init__(self, text: str, complaint: Message) -> None:
-        """Take the text of the error, and the complaint for the page, or an empty dict."""
-        super().__init__(text)
-        self.complaint = complaint
 
 
 def check_legal(action: Any, decision: Decision) -> None:

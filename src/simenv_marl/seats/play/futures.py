@@ -47,8 +47,11 @@ DECISIONS: Final = 8
 TIME_LIMIT: Final = 30.0
 """The time limit of each operation in a future, in seconds."""
 
-Course = list[list[float]]
-"""A row for each decision of the agent in a future: time, return since now, and measures."""
+Course = list[list[Any]]
+"""A row for each decision of the agent in a future: time, return since now, and measures.
+
+A measure that is not there is None.
+"""
 
 
 class Exploration:
@@ -251,7 +254,7 @@ class Futures(Exploration):
     def _play(self, candidate: Candidate, seed: int | None) -> Iterator[None]:
         """Play a future, and add its course to the candidate. Yield after each step."""
         own = self.pending["agent"]
-        course = [[self._start, 0.0, *self._numbers(self.pending["situation"])]]
+        course: Course = [[self._start, 0.0, *self._numbers(self.pending["situation"])]]
         try:
             with self._twin(seed) as twin:
                 twin.step(action_of(self._space, candidate.action))
@@ -263,8 +266,8 @@ class Futures(Exploration):
                             numbers = self._numbers(self._situation(twin))
                         course.append([time, total + reward, *numbers])
                         if candidate.action is None and "rule_action" in info:
-                            self._note_rule(jsonable(info["rule_action"]))
-                    span = info.get("time", time) - self._start
+                            self._note_rule(info["rule_action"])
+                    span = info.get("time", self._start) - self._start
                     is_far = self._horizon.is_reached(len(course) - 1, span)
                     if is_far or (agent == own and ended):
                         break
@@ -277,8 +280,9 @@ class Futures(Exploration):
             candidate.courses.append(course)
 
     def _note_rule(self, action: Action) -> None:
-        words = words_of(self.pending["form"], action)
-        self.rule_action = self.rule_action or {"rule": action, "rule_words": words}
+        if not self.rule_action:
+            rule = jsonable(action)
+            self.rule_action = {"rule": rule, "rule_words": words_of(self.pending["form"], rule)}
 
     def _situation(self, twin: SimulationAECEnv) -> list[Message]:
         """Return the situation of the agent in a future, in which it may have ended."""
@@ -287,10 +291,9 @@ class Futures(Exploration):
             return entries
         return entries_of(labelled(twin.observe(self.pending["agent"])))
 
-    def _numbers(self, situation: list[Message]) -> list[float]:
+    def _numbers(self, situation: list[Message]) -> list[float | None]:
         numbers = {place: entry["number"] for place, entry in enumerate(situation)}
-        found = [numbers.get(place) for place in self.measures]
-        return [float("nan") if number is None else number for number in found]
+        return [numbers.get(place) for place in self.measures]
 
     def message(self, *, is_over: bool) -> Message:
         """Return the message for the page.
@@ -327,7 +330,7 @@ class Futures(Exploration):
 
 def _sampled(course: Course, points: Any) -> Any:
     """Return the returns and measures of a course at points. An ended course stays as it is."""
-    rows = np.nan_to_num(np.array(course), nan=0.0, posinf=1e12, neginf=-1e12)
+    rows = np.nan_to_num(np.array(course, float), nan=0.0, posinf=1e12, neginf=-1e12)
     return np.stack([np.interp(points, rows[:, 0], column) for column in rows.T[1:]], axis=1)
 
 

@@ -381,7 +381,11 @@ def serve(
         if state["type"] == "failed":
             raise OptionValueError(state["text"])
         secret = None if record is None else secret_of(record)
-        base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
+        address, bound, *_ = listener.getsockname()
+        shown_host = f"[{host}]" if ":" in host else host
+        if ip_address(address).is_unspecified:
+            shown_host = socket.gethostname()
+        base = f"http://{shown_host}:{bound}"
         if state["resumed"]:
             print(f"The game of {record} goes on.", flush=True)
         print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
@@ -389,7 +393,7 @@ def serve(
         def announce(path: str) -> None:
             print(f"  {base}{path}", flush=True)
 
-        table = Table(connection, state, announce, secret, is_open=_is_loopback(host))
+        table = Table(connection, state, announce, secret, is_open=ip_address(address).is_loopback)
         _run(table, host, listener, end_game)
     except EOFError:
         process.join()
@@ -401,20 +405,6 @@ def serve(
         listener.close()
     returns = json.loads(table.latest["state"])["returns"]
     return "The returns: " + ", ".join(f"{agent} {total:g}" for agent, total in returns.items())
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
-
-
-def _shown_host(host: str) -> str:
-    """Return the host of the links for an address to listen on."""
-    if host in ("0.0.0.0", "::"):
-        return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
 
 
 def _run(

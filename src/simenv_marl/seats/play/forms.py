@@ -277,8 +277,6 @@ def picture_of(env: SimulationAECEnv) -> Message | None:
             return None
         case np.ndarray(dtype=np.uint8, shape=(_, _, 3)) if rendered.size:
             return {"png": b64encode(_png(rendered)).decode()}
-        case np.ndarray():
-            return {"text": f"an array of shape {rendered.shape}"}
         case _:
             return {"text": str(rendered)[:LONGEST_TEXT]}
 

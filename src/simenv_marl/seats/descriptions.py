@@ -13,13 +13,12 @@ from gymnasium.spaces import (
     Discrete,
     MultiBinary,
     MultiDiscrete,
-    Space,
     Text,
     Tuple,
 )
 from numpy.typing import NDArray
 
-from ..core import Decision, Labels, Mask, pending_view
+from ..core import Decision, Labels, Mask, Space, pending_view
 from ..errors import ViewError, short_repr
 from ..simulation import Observation
 
@@ -233,7 +232,7 @@ def action_schema(decision: Decision) -> Schema:
     return schema_of(space, labels)
 
 
-def schema_of(space: Space[Any], labels: Labels) -> Schema:
+def schema_of(space: Space, labels: Labels) -> Schema:
     """Return the JSON schema of a space, with the labels of its components.
 
     Raises:
@@ -271,9 +270,9 @@ def schema_of(space: Space[Any], labels: Labels) -> Schema:
     }
 
 
-def components_of(space: Space[Any], labels: Labels) -> list[tuple[Any, str, Space[Any]]]:
+def components_of(space: Space, labels: Labels) -> list[tuple[Any, str, Space]]:
     """Return the components of a space: key, label and space of each. Other spaces have none."""
-    parts: Sequence[Space[Any]]
+    parts: Sequence[Space]
     match space:
         case Dict():
             return [(key, str(label_of_part(labels, key)), part) for key, part in space.items()]

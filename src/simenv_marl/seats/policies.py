@@ -3,7 +3,7 @@
 import asyncio
 import os
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Coroutine
 from inspect import isawaitable
 from time import monotonic
 from typing import Any, Final
@@ -14,6 +14,7 @@ from ..core import (
     Caller,
     Decision,
     Info,
+    Policy,
     PolicyWrapper,
     count,
     waits,
@@ -25,7 +26,7 @@ from ..errors import (
     describe_error,
     short_repr,
 )
-from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
+from ..simulation import RULE, Action, Observation, check_count, check_seconds
 from .recordings import Outcome, Recording, outcome_of, question_of
 
 KINDS: Final = (
@@ -45,9 +46,6 @@ Settled = tuple[Action, BaseException | None]
 
 LEFT: Final[set[asyncio.Future[Settled]]] = set()
 """The late answers that have not ended yet. An event loop does not keep its tasks alive."""
-
-Policy = Callable[..., Action | Awaitable[Action]]
-"""A policy, as ``simulate`` takes them. It may be a coroutine function."""
 
 
 class RecordablePolicy(PolicyWrapper):
@@ -113,7 +111,7 @@ class FallbackPolicy(RecordablePolicy):
     def __init__(
         self,
         policy: Policy,
-        fallback: Policy | Sentinel = RULE,
+        fallback: Policy = RULE,
         *,
         timeout: float | None = None,
         retries: int = 0,
@@ -303,7 +301,7 @@ class RecordedPolicy(RecordablePolicy):
         super().__init__(policy, asks=("_decision",))
         self.recording = Recording(path)
         self.records = True
-        self.fallback: Policy | Sentinel = getattr(policy, "fallback", RULE)
+        self.fallback = getattr(policy, "fallback", RULE)
 
     async def decide(self, decision: Decision, *arguments: Any) -> Outcome:
         """Decide, by the policy, which may have a fallback."""

@@ -13,9 +13,9 @@ from typing import Any, Final
 from uuid import uuid4
 
 import numpy as np
-from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Space, Tuple
+from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Tuple
 
-from ..core import Decision, PolicyWrapper, split_extras
+from ..core import Decision, PolicyWrapper, Space, split_extras
 from ..errors import OptionValueError, warn_user
 from ..simulation import RULE, Action, Observation
 
@@ -215,7 +215,7 @@ def question_of(decision: Decision, policy: object) -> Entry:
     }
 
 
-def _outcome_in(entry: Entry, space: Space[Any]) -> Outcome:
+def _outcome_in(entry: Entry, space: Space) -> Outcome:
     """Return the outcome of an entry, also of one of an older version."""
     if "answer" in entry:
         sample = entry["answer"]
@@ -229,7 +229,7 @@ def _outcome_in(entry: Entry, space: Space[Any]) -> Outcome:
 # -- actions as JSON ------------------------------------------------------------------------------
 
 
-def encode(space: Space[Any], action: Action) -> Any:
+def encode(space: Space, action: Action) -> Any:
     """Return a legal action as JSON. ``decode`` returns the same action, of the same types."""
     match space:
         case Dict():
@@ -243,7 +243,7 @@ def encode(space: Space[Any], action: Action) -> Any:
     return _encode_part(action)
 
 
-def decode(space: Space[Any], value: Any) -> Action:
+def decode(space: Space, value: Any) -> Action:
     """Return an action from its JSON."""
     match space:
         case Dict():

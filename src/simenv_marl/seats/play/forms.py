@@ -13,10 +13,10 @@ from operator import getitem
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, Space, Text
+from gymnasium.spaces import Box, Dict, Discrete, Text
 from numpy.typing import NDArray
 
-from ...core import Decision, Labels, Mask
+from ...core import Decision, Labels, Mask, Space
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action
@@ -131,7 +131,7 @@ def _entries(value: JSON, name: str = "") -> Iterator[Message]:
 
 
 def form_of(
-    space: Space[Any],
+    space: Space,
     mask: Mask | None,
     labels: Labels,
 ) -> Message:
@@ -147,7 +147,7 @@ def form_of(
 
 
 def _fields(
-    space: Space[Any],
+    space: Space,
     mask: Any,
     labels: Labels,
     name: str = "",
@@ -165,7 +165,7 @@ def _fields(
 
 
 def _input_of(
-    space: Space[Any],
+    space: Space,
     mask: Any,
     labels: Labels,
 ) -> Message:
@@ -235,7 +235,7 @@ def _value_at(action: Action, path: Iterable[Any]) -> Any:
 
 
 def candidates_of(
-    space: Space[Any],
+    space: Space,
     form: Message,
 ) -> list[Action]:
     """Return actions to try out, as JSON.
@@ -251,7 +251,7 @@ def candidates_of(
     return []
 
 
-def action_of(space: Space[Any], value: Action) -> Action:
+def action_of(space: Space, value: Action) -> Action:
     """Return the action for its JSON; ``RULE`` for None.
 
     A value that does not fit is returned as it is, so that the environment refuses it.

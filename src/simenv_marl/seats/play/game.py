@@ -103,6 +103,7 @@ class Game:
         self.timeline: list[Row] = []
         self.turn = 0
         self.moment = 0
+        self.returns: dict[str, float] = {}
         self._unsaved: list[JSON] = []  # the lines that could not be written yet
         self.episodes: list[Episode] = []
         if self.record is not None and self.record.exists() and not self.new:
@@ -346,17 +347,16 @@ class Game:
 
     def _return_to(self, turn: int) -> None:
         """Continue at a checkpoint. The beginning needs none."""
-        checkpoint = self.checkpoints.get(turn)
         previous = self.env
-        if checkpoint is None:
-            self.env = self.root
-            self.returns: dict[str, float] = {}
-        else:
-            self.env = clone(checkpoint.env)
-            self.returns = {**checkpoint.returns}
         self.over = ""
         self.latest = {row["agent"]: row["turn"] for row in self.timeline[:turn]}
-        if checkpoint is None:
+        if turn in self.checkpoints:
+            checkpoint = self.checkpoints[turn]
+            self.env = clone(checkpoint.env)
+            self.returns = {**checkpoint.returns}
+        else:
+            self.env = self.root
+            self.returns = {}
             self._attempt(self.root.reset, self.seed)
         if previous is not self.root:
             previous.close()

@@ -8,6 +8,7 @@ import select
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from hashlib import blake2b
 from ipaddress import ip_address
@@ -154,7 +155,7 @@ class Table:
         self._opened: dict[str, None] = {}  # the seats whose pages were open at any time
         self._seats: dict[int, str] = {}  # of the links; spectators have none
         self._numbers = count(1)
-        self._inbox: asyncio.Queue[bytes] = asyncio.Queue()
+        self._writer = ThreadPoolExecutor(1)  # because the game may not read
         self._show(state)
 
     async def serve(self, websocket: WebSocket) -> None:
@@ -214,7 +215,7 @@ class Table:
             return "the game is busy; try again"
         else:
             await link.turns.acquire()
-            self._inbox.put_nowait(parcel)
+            self._write(parcel)
             if message.get("do") in MOVES:
                 self._send_all({"type": "busy", "on": True})
         return ""
@@ -232,7 +233,10 @@ class Table:
                 "open": self._is_open,
             }
         )
-        self._inbox.put_nowait(pickle.dumps((None, None, {"taken": people})))
+        self._write(pickle.dumps((None, None, {"taken": people})))
+
+    def _write(self, parcel: bytes) -> None:
+        self._writer.submit(Connection.send_bytes, self._connection, parcel)
 
     def _show(self, message: Message) -> None:
         if message["type"] == "state":
@@ -270,13 +274,6 @@ class Table:
                     _send(message, *links)
                 elif message is not None:
                     self._show(message)
-
-    async def write_game(self) -> None:
-        """Pass messages on to the game."""
-        with suppress(OSError):
-            while True:
-                parcel = await self._inbox.get()
-                await asyncio.to_thread(self._connection.send_bytes, parcel)
 
 
 def _send(message: Message, *links: Link) -> str:
@@ -424,13 +421,11 @@ def _run(
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         nonlocal died
         reader = asyncio.create_task(table.read_game())
-        writer = asyncio.create_task(table.write_game())
         reader.add_done_callback(server.exit_soon)
         yield
         died = reader.done()
         await asyncio.to_thread(end_game)
         await reader
-        writer.cancel()
 
     config = uvicorn.Config(
         make_app(table, host, lifespan),

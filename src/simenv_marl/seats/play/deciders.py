@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any, Final
 from uuid import uuid4
 
 from ...core import (
     Agent,
     AskingPolicy,
-    Episode,
     EpisodeOptions,
     EpisodePolicy,
     Mode,
@@ -31,17 +31,6 @@ PLANS: Final[dict[str, Plan]] = {}
 """Plans with policies, by a token. A clone inherits them, so that no policy is pickled."""
 
 
-class UserEpisode:
-    """An episode in a clone, for policies that decide in the game itself and not in a future."""
-
-    where = Where.USER
-
-    def __init__(self, episode: Episode) -> None:
-        self.seed = episode.seed
-        self.planner_view = episode.planner_view
-        self.read_state = episode.read_state
-
-
 class Deciders:
     """The policies of a game."""
 
@@ -58,8 +47,9 @@ class Deciders:
             SimEnvError: An argument is invalid.
         """
         self._token = uuid4().hex
-        named = {key: policy for key, policy in policies.items() if policy is not RULE}
-        self._names = {portable(key): name_of(policy) for key, policy in named.items()}
+        self._names = {
+            portable(key): name_of(policy) for key, policy in policies.items() if policy is not RULE
+        }
         if policies:
             settings = {**options, "policies": policies, "max_steps": None}
             PLANS[self._token] = plan_of(simulation, points, settings, mode=Mode.SIMULATE)
@@ -96,7 +86,13 @@ def _answer(
         return None
     policy = two_arguments(policy)
     if isinstance(policy, AskingPolicy) and not future:
-        episode = UserEpisode(episode)
+        # It decides in the game itself, also where that goes on in a clone.
+        episode = SimpleNamespace(
+            where=Where.USER,
+            seed=episode.seed,
+            planner_view=episode.planner_view,
+            read_state=episode.read_state,
+        )
     observation = agent.hand_out()
     if isinstance(policy, EpisodePolicy):
         action = policy.answer(episode, agent, observation, agent.info)

@@ -1,5 +1,6 @@
 """Decisions, actions and pictures as JSON, in the words that people read."""
 
+import json
 import re
 import struct
 import zlib
@@ -8,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import reduce
 from itertools import islice
-from math import inf, isfinite, prod
+from math import inf, prod
 from operator import getitem
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Text
 from numpy.typing import NDArray
 
-from ...core import Decision, Labels, Mask, Space
+from ...core import Decision, Labels, Mask, Space, as_json
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action
@@ -51,33 +52,22 @@ NUMBER: Final = re.compile(r"\s*[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 """The number with which a displayed text may begin, such as "22 °C"."""
 
 
-def jsonable(value: object) -> JSON:
+def jsonable(value: object) -> Any:
     """Return a value as JSON.
 
     Arrays become lists. Numbers that are not finite, and objects, become texts.
     """
-    match value:
-        case np.ndarray() | np.generic():
-            return jsonable(value.tolist())
-        case Mapping():
-            return {str(key): jsonable(part) for key, part in value.items()}
-        case list() | tuple():
-            return [jsonable(part) for part in value]
-        case float() if not isfinite(value):
-            return str(value)
-        case str() | int() | float() | None:
-            return value
-        case _:
-            return short_repr(value)
+    text = json.dumps(as_json(value))
+    return json.loads(text, parse_constant=lambda name: str(float(name)))
 
 
 def shown(value: object) -> str:
     """Return a value as a text for people. Fractions have four digits."""
+    if isinstance(value, np.generic):
+        value = value.item()
     match value:
-        case bool() | np.bool():
+        case bool():
             return "yes" if value else "no"
-        case np.ndarray() | np.generic():
-            return shown(value.tolist())
         case float() if 1_000 <= abs(value) < 1e15:
             return f"{value:.0f}"
         case float():

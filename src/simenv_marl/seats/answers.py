@@ -19,13 +19,12 @@ from gymnasium.spaces import (
     Discrete,
     MultiBinary,
     MultiDiscrete,
-    Space,
     Text,
     Tuple,
 )
 from numpy.typing import NDArray
 
-from ..core import Decision, Labels
+from ..core import Decision, Labels, Space
 from ..errors import InvalidActionError, short_repr
 from ..simulation import Action
 from .descriptions import JSON, at_decision, label_of_part, legal_lines
@@ -239,7 +238,7 @@ def _number(text: str) -> float:
 
 
 def to_action(
-    space: Space[Any],
+    space: Space,
     value: Action,
     labels: Labels = None,
 ) -> Action:
@@ -289,7 +288,7 @@ def _listed(value: Action, labels: Labels) -> Action:
     return [value[name] for name in labels or map(str, numbers)]
 
 
-def _to_array(space: Space[Any], value: Action) -> NDArray[Any]:
+def _to_array(space: Space, value: Action) -> NDArray[Any]:
     numbers = np.asarray(value)
     if numbers.dtype.kind == "U":
         numbers = np.array([_number(text) for text in numbers.ravel().tolist()])

@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from math import inf, isfinite
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -13,13 +13,12 @@ from gymnasium.spaces import (
     Discrete,
     MultiBinary,
     MultiDiscrete,
-    Space,
     Text,
     Tuple,
 )
 from numpy.typing import NDArray
 
-from ..core import Decision, Labels, Mask, pending_view
+from ..core import Decision, Labels, Mask, Space, pending_view
 from ..errors import ViewError, short_repr
 from ..simulation import Observation
 
@@ -189,11 +188,11 @@ def legal_lines(decision: Decision) -> list[str]:
         case {"enum": labels}:
             return [f"- {label}" for label in labels]
         case {"properties": parts}:
-            lines = [f"- {name}: {_limits(part)}" for name, part in parts.items()]
+            lines = [f"- {name}: {limits_of(part)}" for name, part in parts.items()]
         case {"description": label}:
-            lines = [f"- {label}: {_limits(schema)}"]
+            lines = [f"- {label}: {limits_of(schema)}"]
         case {"type": _}:
-            lines = [f"- {_limits(schema)}"]
+            lines = [f"- {limits_of(schema)}"]
         case _:
             lines = [f"- {decision.action_space}"]
     if decision.mask is not None:
@@ -201,18 +200,22 @@ def legal_lines(decision: Decision) -> list[str]:
     return lines
 
 
-def _limits(schema: Schema) -> str:
-    if "properties" in schema:
-        parts = schema["properties"].items()
-        texts = [f"{name}: {_limits(part)}" for name, part in parts]
-        return f"({', '.join(texts)})"
-    if schema["type"] == "string":
-        characters = schema["pattern"][2:-3]
-        return f"{schema['minLength']} to {schema['maxLength']} characters of {characters}"
-    noun = "an integer" if schema["type"] == "integer" else "a number"
-    low = _value_text(schema.get("minimum", -inf))
-    high = _value_text(schema.get("maximum", inf))
-    return f"{noun} from {low} to {high}"
+def limits_of(schema: Schema) -> str:
+    """Return the values that a JSON schema allows, in words."""
+    noun = "a whole number" if schema.get("type") == "integer" else "a number"
+    match schema:
+        case {"properties": parts}:
+            texts = [f"{name}: {limits_of(part)}" for name, part in parts.items()]
+            return f"({', '.join(texts)})"
+        case {"minLength": least, "maxLength": most, "pattern": pattern}:
+            return f"{least} to {most} characters of {pattern[2:-3]}"
+        case {"minimum": low, "maximum": high}:
+            return f"{noun} from {_value_text(low)} to {_value_text(high)}"
+        case {"minimum": low}:
+            return f"{noun} of at least {_value_text(low)}"
+        case {"maximum": high}:
+            return f"{noun} of at most {_value_text(high)}"
+    return noun
 
 
 def action_schema(decision: Decision) -> Schema:
@@ -226,11 +229,15 @@ def action_schema(decision: Decision) -> Schema:
     if isinstance(space, Discrete) and isinstance(labels, Mapping):
         legal = [labels[action] for action in legal_actions(space, decision.mask)]
         return {"type": "string", "enum": legal}
-    return _schema(space, labels)
+    return schema_of(space, labels)
 
 
-def _schema(space: Space[Any], labels: Labels) -> Schema:
-    parts: Iterable[Schema]
+def schema_of(space: Space, labels: Labels) -> Schema:
+    """Return the JSON schema of a space, with the labels of its components.
+
+    Raises:
+        ViewError: A part of the space has no names or numbers.
+    """
     match space:
         case Discrete():
             return _range(int(space.start), int(space.start + space.n - 1))
@@ -248,25 +255,40 @@ def _schema(space: Space[Any], labels: Labels) -> Schema:
             if labels and labels != UNLABELLED_NUMBER:
                 schema["description"] = labels[0]
             return schema
-        case Dict():
-            labels = [str(label_of_part(labels, key)) for key in space]
-            parts = [_schema(part, None) for part in space.values()]
-        case Tuple() | MultiDiscrete(shape=(_,)):
-            parts = [_schema(space[place], None) for place in range(len(space))]
-        case Box(shape=(_,)):
-            parts = map(_range, _numbers(space.low), _numbers(space.high))
-        case MultiBinary(shape=(size,)):
-            parts = [_range(0, 1)] * size
+        case Box(shape=(_, _, *_)):
+            parts = []  # JSON has no names for the components of matrices
         case _:
-            raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
-    parts = list(parts)
-    names = labels or list(map(str, range(len(parts))))
+            parts = components_of(space, labels)
+    if not parts:
+        raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
+    properties = {label: schema_of(part, None) for _, label, part in parts}
     return {
         "type": "object",
-        "properties": dict(zip(names, parts, strict=True)),
-        "required": list(names),
+        "properties": properties,
+        "required": [*properties],
         "additionalProperties": False,
     }
+
+
+def components_of(space: Space, labels: Labels) -> list[tuple[Any, str, Space]]:
+    """Return the components of a space: key, label and space of each. Other spaces have none."""
+    parts: Sequence[Space]
+    match space:
+        case Dict():
+            return [(key, str(label_of_part(labels, key)), part) for key, part in space.items()]
+        case Tuple():
+            parts = space.spaces
+        case MultiDiscrete(shape=(size,)):
+            parts = [space[place] for place in range(size)]
+        case MultiBinary(shape=(size,)):
+            parts = [Discrete(2)] * size
+        case Box(shape=(_, *shape)):
+            bounds = zip(space.low, space.high, strict=True)
+            parts = [Box(low, high, shape, space.dtype) for low, high in bounds]
+        case _:
+            return []
+    numbers = range(len(parts))
+    return [*zip(numbers, labels or map(str, numbers), parts, strict=True)]
 
 
 def _range(low: float, high: float) -> Schema:

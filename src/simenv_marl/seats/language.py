@@ -5,7 +5,6 @@ import os
 from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
-from itertools import chain
 from time import perf_counter
 from typing import Any
 from uuid import uuid4
@@ -148,14 +147,11 @@ class LanguageModelPolicy:
             LanguageModelError: The last request failed, or brought no answer.
             MissingExtraError: The package ``openai`` is missing.
         """
-        turns: deque[tuple[Message, Message]] = _decision.memory.setdefault(
-            self._token, deque(maxlen=self._history_length)
+        past: deque[Message] = _decision.memory.setdefault(
+            self._token, deque(maxlen=2 * self._history_length)
         )
         question = {"role": "user", "content": self._describe(_decision)}
-        messages = [
-            *chain.from_iterable(turns),
-            question,
-        ]
+        messages = [*past, question]
         for retry in range(self._retries + 1):
             text = ""
             try:
@@ -170,7 +166,7 @@ class LanguageModelPolicy:
                         {"role": "assistant", "content": text},
                         {"role": "user", "content": str(error)},
                     ]
-        turns.append((question, {"role": "assistant", "content": text}))
+        past += [question, {"role": "assistant", "content": text}]
         return action
 
     # -- prompts ----------------------------------------------------------------------------------
@@ -264,15 +260,14 @@ def _content(response: Any, model: str) -> str:
     Raises:
         _NoAnswerError: It has none, or not the whole.
     """
-    choice = next(iter(getattr(response, "choices", None) or ()), None)
+    choice, *_ = getattr(response, "choices", None) or [None]
     message = getattr(choice, "message", None)
     content = getattr(message, "content", None)
     refusal = getattr(message, "refusal", None)
     reason = getattr(choice, "finish_reason", None)
     if isinstance(content, list):
-        parts = [part if isinstance(part, dict) else vars(part) for part in content]
-        refusal = refusal or "".join(part.get("refusal", "") for part in parts)
-        content = "".join(part["text"] for part in parts if part.get("type") == "text")
+        refusal = refusal or "".join(part.get("refusal", "") for part in content)
+        content = "".join(part["text"] for part in content if part.get("type") == "text")
     kind = "failed"
     if message is None:
         problem = f"the endpoint returned {short_repr(response)}"

@@ -3,9 +3,7 @@
 import asyncio
 import os
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine
-from contextlib import suppress
-from copy import copy
+from collections.abc import Awaitable, Coroutine
 from inspect import isawaitable
 from time import monotonic
 from typing import Any, Final
@@ -16,10 +14,10 @@ from ..core import (
     Caller,
     Decision,
     Info,
+    Policy,
     PolicyWrapper,
     count,
     waits,
-    when_answered,
 )
 from ..errors import (
     InvalidActionError,
@@ -28,7 +26,7 @@ from ..errors import (
     describe_error,
     short_repr,
 )
-from ..simulation import RULE, Action, Observation, Sentinel, check_count, check_seconds
+from ..simulation import RULE, Action, Observation, check_count, check_seconds
 from .recordings import Outcome, Recording, outcome_of, question_of
 
 KINDS: Final = (
@@ -49,11 +47,55 @@ Settled = tuple[Action, BaseException | None]
 LEFT: Final[set[asyncio.Future[Settled]]] = set()
 """The late answers that have not ended yet. An event loop does not keep its tasks alive."""
 
-Policy = Callable[..., Action | Awaitable[Action]]
-"""A policy, as ``simulate`` takes them. It may be a coroutine function."""
+
+class RecordablePolicy(PolicyWrapper):
+    """A policy around another one, whose answers can be recorded."""
+
+    recording: Recording | None = None
+
+    def __call__(
+        self,
+        observation: Observation,
+        info: Info | None = None,
+        *,
+        _decision: Decision,
+        **context: object,
+    ) -> Action | Awaitable[Action]:
+        """Answer a decision. Return an awaitable if a policy has to be awaited."""
+        context["_decision"] = _decision
+        answer = self.answer(self.recording, _decision, observation, info, context)
+        return answer if self.waits else _run_without_waiting(answer)
+
+    async def answer(
+        self,
+        recording: Recording | None,
+        decision: Decision,
+        *arguments: Any,
+    ) -> Action:
+        """Answer with the arguments of a ``Caller``, or as recorded."""
+        if recording is None:
+            return (await self.decide(decision, *arguments)).answer
+        question = question_of(decision, self)
+        outcome = recording.find(question, decision)
+        if outcome is None:
+            outcome = await self.decide(decision, *arguments)
+            recording.write(question, outcome, decision)
+        else:
+            self.repeat(decision, outcome)
+        return outcome.answer
+
+    async def decide(self, decision: Decision, *arguments: Any) -> Outcome:
+        """Decide, by the policy."""
+        answer = self.ask(*arguments)
+        if self.waits and isawaitable(answer):
+            answer = await answer
+        return outcome_of(answer, decision)
+
+    def repeat(self, decision: Decision, outcome: Outcome) -> None:
+        """Note an outcome that was recorded."""
 
 
-class FallbackPolicy(PolicyWrapper):
+class FallbackPolicy(RecordablePolicy):
     """A policy that answers by a fallback where another policy is late, fails or answers illegally.
 
     Evaluations show the share of decisions that a fallback has answered. In clones nothing is
@@ -69,7 +111,7 @@ class FallbackPolicy(PolicyWrapper):
     def __init__(
         self,
         policy: Policy,
-        fallback: Policy | Sentinel = RULE,
+        fallback: Policy = RULE,
         *,
         timeout: float | None = None,
         retries: int = 0,
@@ -91,9 +133,8 @@ class FallbackPolicy(PolicyWrapper):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
         self._ask_fallback = Caller(fallback if callable(fallback) else _leave_to_rule)
         super().__init__(policy, asks=("_decision", *self._ask_fallback.names))
-        self._recording: Recording | None = None
         if isinstance(policy, RecordedPolicy):  # this policy records instead, also its fallback
-            self._recording = policy.recording
+            self.recording = policy.recording
             self.ask = policy.ask
         self.fallback = fallback
         self.timeout = None if timeout is None else check_seconds(timeout, "timeout")
@@ -114,44 +155,7 @@ class FallbackPolicy(PolicyWrapper):
         counts = COUNTS.get(self._token, {})
         return {kind: int(counts.get(kind, 0)) for kind in KINDS}
 
-    def __call__(
-        self,
-        observation: Observation,
-        info: Info | None = None,
-        *,
-        _decision: Decision,
-        **context: object,
-    ) -> Action | Awaitable[Action]:
-        """Answer a decision. Return an awaitable if one of the two policies has to be awaited."""
-        context["_decision"] = _decision
-        answer = self._answer(_decision, observation, info, context)
-        if self.waits:
-            return answer
-        return _run_without_waiting(answer)
-
-    def recorded_in(self, recording: Recording) -> "FallbackPolicy":
-        """Return a copy that records its answers, and counts together with this policy."""
-        twin = copy(self)
-        twin._recording = recording
-        return twin
-
-    async def _answer(self, decision: Decision, *arguments: Any) -> Action:
-        """Answer with the arguments of a ``Caller``, or as recorded."""
-        recording = self._recording
-        if recording is None:
-            return (await self._decide(decision, *arguments)).answer
-        question = question_of(decision, self.ask.policy)
-        outcome = recording.find(question, decision)
-        if outcome is None:
-            outcome = await self._decide(decision, *arguments)
-            recording.write(question, outcome, decision)
-        else:
-            self.last_error = outcome.why or self.last_error
-            for kind, number in outcome.counts.items():
-                self._count(decision, kind, number)
-        return outcome.answer
-
-    async def _decide(self, decision: Decision, *arguments: Any) -> Outcome:
+    async def decide(self, decision: Decision, *arguments: Any) -> Outcome:
         """Decide, by the policy or the fallback."""
         counts: Counter[str] = Counter()
         why = ""
@@ -177,6 +181,12 @@ class FallbackPolicy(PolicyWrapper):
         if isawaitable(answer):
             answer = await answer
         return outcome_of(answer, decision, by="fallback", why=why, counts=counts)
+
+    def repeat(self, decision: Decision, outcome: Outcome) -> None:
+        """Count what was counted when an outcome was recorded."""
+        self.last_error = outcome.why or self.last_error
+        for kind, number in outcome.counts.items():
+            self._count(decision, kind, number)
 
     async def _ask_in_time(self, *arguments: Any) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
@@ -261,7 +271,7 @@ def _run_without_waiting(coroutine: Coroutine[None, None, Action]) -> Action:
     raise AssertionError("the coroutine waits")
 
 
-class RecordedPolicy(PolicyWrapper):
+class RecordedPolicy(RecordablePolicy):
     """A policy that records the answers of another one in a file, and repeats them.
 
     Each answer is a line of JSON: seed, agent and number of the decision, digests of observation
@@ -291,34 +301,15 @@ class RecordedPolicy(PolicyWrapper):
         super().__init__(policy, asks=("_decision",))
         self.recording = Recording(path)
         self.records = True
-        self.fallback: Policy | Sentinel = getattr(policy, "fallback", RULE)
-        self._guard: FallbackPolicy | None = None
-        if isinstance(policy, FallbackPolicy):
-            self._guard = policy.recorded_in(self.recording)
+        self.fallback = getattr(policy, "fallback", RULE)
 
-    def __call__(
-        self,
-        observation: Observation,
-        info: Info | None = None,
-        *,
-        _decision: Decision,
-        **context: object,
-    ) -> Action | Awaitable[Action]:
-        """Answer a decision.
+    async def decide(self, decision: Decision, *arguments: Any) -> Outcome:
+        """Decide, by the policy, which may have a fallback."""
+        if isinstance(self.policy, FallbackPolicy):
+            return await self.policy.decide(decision, *arguments)
+        return await super().decide(decision, *arguments)
 
-        Return an awaitable if the answer is not recorded and the policy has to be awaited.
-        """
-        if self._guard is not None:
-            return self._guard(observation, info, _decision=_decision, **context)
-        question = question_of(_decision, self.policy)
-        outcome = self.recording.find(question, _decision)
-        if outcome is not None:
-            return outcome.answer
-
-        def record(answer: Action) -> Action:
-            with suppress(InvalidActionError):  # an illegal answer is not recorded
-                self.recording.write(question, outcome_of(answer, _decision), _decision)
-            return answer
-
-        context["_decision"] = _decision
-        return when_answered(self.ask(observation, info, context), record)
+    def repeat(self, decision: Decision, outcome: Outcome) -> None:
+        """Let a policy with a fallback count what it has counted before."""
+        if isinstance(self.policy, FallbackPolicy):
+            self.policy.repeat(decision, outcome)

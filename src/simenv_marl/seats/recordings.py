@@ -6,16 +6,16 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from uuid import uuid4
 
 import numpy as np
-from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Space, Tuple
+from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Tuple
 
-from ..core import Decision, PolicyWrapper, split_extras
+from ..core import Decision, PolicyWrapper, Space, split_extras
 from ..errors import OptionValueError, warn_user
 from ..simulation import RULE, Action, Observation
 
@@ -32,7 +32,6 @@ class Lines:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Name the file. The first line creates it."""
         self.path = Path(path)
-        self._may_be_torn = True
 
     def read(self) -> Iterator[tuple[int, Any]]:
         """Yield the numbers of the lines, from 1, and their values.
@@ -50,31 +49,24 @@ class Lines:
         """
         lines = [json.dumps(value, ensure_ascii=False) for value in values]
         text = "".join(f"{line}\n" for line in lines).encode()
-        may_be_torn, self._may_be_torn = self._may_be_torn, True  # until all is written
         with open(self.path, "ab+", buffering=0) as file:
-            if may_be_torn and file.tell():
+            if file.tell():
                 file.seek(-1, os.SEEK_END)
                 text = text if file.read(1) == b"\n" else b"\n" + text
             file.write(text)
-        self._may_be_torn = False
 
 
 # -- answers --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Question:
-    """A decision, as recordings identify it."""
+Entry = dict[str, Any]
+"""A line of a recording, or its question, without an outcome.
 
-    seed: int
-    agent: str
-    number: int
-    observation: str
-    """The digest of the observation."""
-    legal: str | None = None
-    """The digest of the legal actions. None: any; older recordings do not have it."""
-    policy: Mapping[str, str] = field(default_factory=dict)
-    """The identity of the policy, such as a language model's name and the digest of its prompt."""
+The question is the ``seed``, the ``agent``, the ``number`` of the decision, digests of its
+``observation`` and of its ``legal`` actions (older recordings have none), and the identity of the
+``policy``, such as a language model's name and the digest of its prompt. The outcome is an
+``Outcome`` as JSON. ``run`` is the recording that has written the line.
+"""
 
 
 @dataclass(frozen=True)
@@ -98,23 +90,7 @@ class Outcome:
         return (self.action, self.extras) if self.extras else self.action
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """An action as JSON in a recording of an older version."""
-
-    json: Any
-
-
-class _Line(NamedTuple):
-    """A line of a recording; the action of its outcome is JSON."""
-
-    question: Question
-    outcome: Outcome
-    run: str | None
-    """The recording that has written the line."""
-
-
-class Recording:
+class Recording(Lines):
     """The answers in a file.
 
     They are found by seed, agent, observation and legal actions. Equal ones are given in the order
@@ -127,96 +103,87 @@ class Recording:
         Raises:
             OptionValueError: The folder of the file does not exist.
         """
-        self.path = Path(path)
+        super().__init__(path)
         if not self.path.parent.is_dir():
             raise OptionValueError(
                 f"{self.path} cannot be written: {self.path.parent} is no folder"
             )
-        self._file = Lines(path)
         self._run = uuid4().hex[:12]
-        self._lines: dict[tuple[int, str], list[_Line]] | None = None
+        self._entries: dict[tuple[int, str], list[Entry]] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Return the state without the lines, because the file has them, too."""
-        return {**vars(self), "_lines": None}
+        """Return the state without the entries, because the file has them, too."""
+        return {**vars(self), "_entries": None}
 
-    def find(self, question: Question, decision: Decision) -> Outcome | None:
+    def find(self, question: Entry, decision: Decision) -> Outcome | None:
         """Return the recorded outcome of a decision. None: it has to be decided.
 
         Raises:
             OptionValueError: Another policy has answered it, or the file has only answers to other
                 decisions of this agent in this episode.
         """
-        lines = self._lines_of(question)
         given = self._given(decision)
         others = []
-        for place, line in enumerate(lines):
+        for place, entry in enumerate(self._entries_of(question)):
             if place in given:
                 continue
-            asked = line.question
-            is_same = asked.observation == question.observation
-            if is_same and asked.legal in (None, question.legal):
-                self._check_policy(question, asked)
+            is_same = entry["observation"] == question["observation"]
+            if is_same and entry.get("legal") in (None, question["legal"]):
+                self._check_policy(question, entry)
                 given.add(place)
-                return _decoded(line.outcome, decision.action_space)
-            if line.run != self._run:
-                others.append(asked)
+                return _outcome_in(entry, decision.action_space)
+            if entry.get("run") != self._run:
+                others.append(entry["observation"])
         if others:
-            raise self._refusal(question, others)
+            is_seen = question["observation"] in others
+            problem = "its legal actions" if is_seen else "its observation"
+            raise OptionValueError(
+                f"{self.path} has no answer to decision {question['number']} of"
+                f" {question['agent']!r} in the episode of seed {question['seed']}, but"
+                f" {len(others)} to others that are not asked: {problem} and the recorded ones"
+                " differ; use the model, the policies and the options of the recording, or record"
+                " in another file"
+            )
         return None
 
-    def write(self, question: Question, outcome: Outcome, decision: Decision) -> None:
+    def write(self, question: Entry, outcome: Outcome, decision: Decision) -> None:
         """Append the outcome of a decision."""
-        action = None if outcome.action is RULE else encode(decision.action_space, outcome.action)
-        extras = {name: _encode_part(part) for name, part in outcome.extras.items()}
-        outcome = replace(outcome, action=action, extras=extras)
-        entry = vars(question) | vars(outcome) | {"run": self._run}
-        empty = [name for name in ("policy", "extras", "why", "counts") if not entry[name]]
-        self._file.append({name: entry[name] for name in entry if name not in empty})
-        lines = self._lines_of(question)
-        self._given(decision).add(len(lines))
-        lines.append(_Line(question, outcome, self._run))
+        entry = question | vars(outcome) | {"run": self._run}
+        is_rule = outcome.action is RULE
+        entry["action"] = None if is_rule else encode(decision.action_space, outcome.action)
+        entry["extras"] = {name: _encode_part(part) for name, part in outcome.extras.items()}
+        optional = ("policy", "extras", "why", "counts")
+        entry = {name: part for name, part in entry.items() if part or name not in optional}
+        self.append(entry)
+        entries = self._entries_of(question)
+        self._given(decision).add(len(entries))
+        entries.append(entry)
 
     def _given(self, decision: Decision) -> set[int]:
         """Return the places of the lines that this agent has been given in this episode."""
         given: set[int] = decision.memory.setdefault(self._run, set())
         return given
 
-    def _lines_of(self, question: Question) -> list[_Line]:
-        """Return the lines of the agent and the seed of a decision."""
-        if self._lines is None:
-            self._lines = defaultdict(list)
-            for number, entry in self._file.read() if self.path.exists() else ():
+    def _entries_of(self, question: Entry) -> list[Entry]:
+        """Return the entries of the agent and the seed of a decision."""
+        if self._entries is None:
+            self._entries = defaultdict(list)
+            for number, entry in self.read() if self.path.exists() else ():
                 try:
-                    line = _line_of(entry)
+                    seed, agent, _ = (entry[name] for name in ("seed", "agent", "observation"))
+                    self._entries[seed, agent].append(entry)
                 except (TypeError, LookupError):
                     warn_user(f"line {number} of {self.path} is no answer, and is left out")
-                    continue
-                self._lines[line.question.seed, line.question.agent].append(line)
-        return self._lines[question.seed, question.agent]
+        return self._entries[question["seed"], question["agent"]]
 
-    def _check_policy(self, question: Question, asked: Question) -> None:
-        differing = [
-            name for name in asked.policy if asked.policy[name] != question.policy.get(name)
-        ]
-        for name in differing:
-            raise OptionValueError(
-                f"{self.path} has the answers of another policy: its {name} is"
-                f" {asked.policy[name]!r}, and now {question.policy.get(name)!r}; record in another"
-                " file"
-            )
-
-    def _refusal(self, question: Question, others: list[Question]) -> OptionValueError:
-        """Return the error that says how a decision differs from the recorded ones."""
-        problem = "its observation"
-        if question.observation in [other.observation for other in others]:
-            problem = "its legal actions"
-        return OptionValueError(
-            f"{self.path} has no answer to decision {question.number} of {question.agent!r} in the"
-            f" episode of seed {question.seed}, but {len(others)} to others that are not asked:"
-            f" {problem} and the recorded ones differ; use the model, the policies and the options"
-            " of the recording, or record in another file"
-        )
+    def _check_policy(self, question: Entry, entry: Entry) -> None:
+        for name, recorded in entry.get("policy", {}).items():
+            present = question["policy"].get(name)
+            if recorded != present:
+                raise OptionValueError(
+                    f"{self.path} has the answers of another policy: its {name} is {recorded!r},"
+                    f" and now {present!r}; record in another file"
+                )
 
 
 def outcome_of(answer: Action, decision: Decision, **parts: Any) -> Outcome:
@@ -231,53 +198,38 @@ def outcome_of(answer: Action, decision: Decision, **parts: Any) -> Outcome:
     return Outcome(action, extras, **parts)
 
 
-def question_of(decision: Decision, policy: object) -> Question:
+def question_of(decision: Decision, policy: object) -> Entry:
     """Return a decision as recordings identify it, for the policy that answers it."""
     while isinstance(policy, PolicyWrapper):
         policy = policy.policy
     labels = decision.action_labels
     texts = labels.items() if isinstance(labels, Mapping) else labels
-    legal = digest_of((decision.mask, _ADDRESS.sub("", repr(texts and [*texts]))))
     identify = getattr(policy, "identify", None)
-    return Question(
-        decision.seed,
-        decision.agent,
-        decision.number,
-        digest_of(decision.observation),
-        legal,
-        {} if identify is None else identify(decision),
-    )
+    return {
+        "seed": decision.seed,
+        "agent": decision.agent,
+        "number": decision.number,
+        "observation": digest_of(decision.observation),
+        "legal": digest_of((decision.mask, _ADDRESS.sub("", repr(texts and [*texts])))),
+        "policy": {} if identify is None else identify(decision),
+    }
 
 
-def _line_of(entry: Mapping[str, Any]) -> _Line:
-    """Return the line of an entry, also of one of an older version."""
-    question = Question(**_parts(entry, Question))
-    if "answer" in entry:  # an older version
+def _outcome_in(entry: Entry, space: Space) -> Outcome:
+    """Return the outcome of an entry, also of one of an older version."""
+    if "answer" in entry:
         sample = entry["answer"]
-        return _Line(question, Outcome(None if sample is None else _Sample(sample)), None)
-    outcome = Outcome(**_parts(entry, Outcome))
-    return _Line(question, outcome, entry["run"])
-
-
-def _parts(entry: Mapping[str, Any], kind: type[Question | Outcome]) -> dict[str, Any]:
-    return {part.name: entry[part.name] for part in fields(kind) if part.name in entry}
-
-
-def _decoded(outcome: Outcome, space: Space[Any]) -> Outcome:
-    action = outcome.action
-    extras = {name: _decode_part(part) for name, part in outcome.extras.items()}
-    outcome = replace(outcome, extras=extras)
-    if action is None:
-        return replace(outcome, action=RULE)
-    if isinstance(action, _Sample):
-        return replace(outcome, action=space.from_jsonable(action.json)[0])
-    return replace(outcome, action=decode(space, action))
+        return Outcome(RULE if sample is None else space.from_jsonable(sample)[0])
+    action = RULE if entry["action"] is None else decode(space, entry["action"])
+    extras = {name: _decode_part(part) for name, part in entry.get("extras", {}).items()}
+    others = {name: entry[name] for name in ("by", "why", "counts") if name in entry}
+    return Outcome(action, extras, **others)
 
 
 # -- actions as JSON ------------------------------------------------------------------------------
 
 
-def encode(space: Space[Any], action: Action) -> Any:
+def encode(space: Space, action: Action) -> Any:
     """Return a legal action as JSON. ``decode`` returns the same action, of the same types."""
     match space:
         case Dict():
@@ -291,7 +243,7 @@ def encode(space: Space[Any], action: Action) -> Any:
     return _encode_part(action)
 
 
-def decode(space: Space[Any], value: Any) -> Action:
+def decode(space: Space, value: Any) -> Action:
     """Return an action from its JSON."""
     match space:
         case Dict():

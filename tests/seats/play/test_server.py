@@ -393,6 +393,15 @@ def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):
     assert "link of this seat" in lobby.wait("error")["text"]
 
 
+def test_the_lobby_never_gives_the_link_of_the_facilitator():
+    server = Server("--tools", "facilitator")
+    lobby = server.page()
+    lobby.socket.send(json.dumps({"do": "claim", "seat": ""}))
+    assert "not one of this page" in lobby.wait("error")["text"]
+    lobby.socket.close()
+    assert server.end()[0] == 0
+
+
 def test_a_number_that_is_too_large_never_returns_as_infinity(buyer):
     buyer.socket.send(
         json.dumps({"key": buyer.key, "do": "act", "turn": 0, "action": 0}).replace(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any, Final
 from uuid import uuid4
 
 from ...core import (
     Agent,
     AskingPolicy,
-    Episode,
     EpisodeOptions,
     EpisodePolicy,
     Mode,
@@ -31,18 +31,6 @@ PLANS: Final[dict[str, Plan]] = {}
 """Plans with policies, by a token. A clone inherits them, so that no policy is pickled."""
 
 
-class UserEpisode:
-    """An episode in a clone, for policies that decide in the game itself and not in a future."""
-
-    where = Where.USER
-
-    def __init__(self, episode: Episode) -> None:
-        self.seed = episode.seed
-        self.simulation = episode.simulation
-        self.planner_view = episode.planner_view
-        self.read_state = episode.read_state
-
-
 class Deciders:
     """The policies of a game."""
 
@@ -59,15 +47,12 @@ class Deciders:
             SimEnvError: An argument is invalid.
         """
         self._token = uuid4().hex
-        named = {key: policy for key, policy in policies.items() if policy is not RULE}
-        self._names = {portable(key): name_of(policy) for key, policy in named.items()}
+        self._names = {
+            portable(key): name_of(policy) for key, policy in policies.items() if policy is not RULE
+        }
         if policies:
             settings = {**options, "policies": policies, "max_steps": None}
             PLANS[self._token] = plan_of(simulation, points, settings, mode=Mode.SIMULATE)
-
-    def __bool__(self) -> bool:
-        """Return whether there are policies."""
-        return bool(self._names)
 
     def name_for(self, agent: str, point: str) -> str:
         """Return the name of the policy that decides for an agent of a point; "" for none."""
@@ -82,7 +67,7 @@ class Deciders:
             future: Whether a future is tried out, in place of policies that wait by their
                 fallbacks.
         """
-        if not self:
+        if not self._names:
             return None
         return env.call(_answer, self._token, future)
 
@@ -95,16 +80,21 @@ def _answer(
     episode: Any = view.episode
     agent: Agent = episode.deciding
     plan = PLANS[token]
-    hook = agent.point.hook
-    points = [point for point in plan.points if point.hook is hook]
+    points = [point for point in plan.points if point.hook is agent.point.hook]
     policy: Any = plan.policy_of(agent.name, points[0]) if points else RULE
     if policy is RULE:
         return None
     policy = two_arguments(policy)
-    observation = agent.hand_out()
     if isinstance(policy, AskingPolicy) and not future:
-        action = policy.answer(UserEpisode(episode), agent, observation, agent.info)
-    elif isinstance(policy, EpisodePolicy):
+        # It decides in the game itself, also where that goes on in a clone.
+        episode = SimpleNamespace(
+            where=Where.USER,
+            seed=episode.seed,
+            planner_view=episode.planner_view,
+            read_state=episode.read_state,
+        )
+    observation = agent.hand_out()
+    if isinstance(policy, EpisodePolicy):
         action = policy.answer(episode, agent, observation, agent.info)
     else:
         action = policy(observation, agent.info)

@@ -1,25 +1,36 @@
 """Decisions, actions and pictures as JSON, in the words that people read."""
 
+import json
 import re
 import struct
 import zlib
 from base64 import b64encode
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import reduce
 from itertools import islice
-from math import inf, isfinite
+from math import inf, prod
+from operator import getitem
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Text, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, Text
 from numpy.typing import NDArray
 
-from ...core import Decision, Labels, Mask
+from ...core import Decision, Labels, Mask, Space, as_json
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
-from ...simulation import RULE, Action, Observation
+from ...simulation import RULE, Action
 from ..answers import MISFITS, to_action
-from ..descriptions import JSON, labelled, legal_actions, situation
+from ..descriptions import (
+    JSON,
+    components_of,
+    label_of_part,
+    legal_actions,
+    limits_of,
+    schema_of,
+    situation,
+)
 from ..recordings import digest_of
 
 Message = dict[str, Any]
@@ -37,48 +48,30 @@ MOST_ENTRIES: Final = 64
 LONGEST_TEXT: Final = 20_000
 """The largest number of characters of a rendered text on the page."""
 
-NUMBER: Final = re.compile(r"\s*[-+]?\d+(\.\d+)?")
+NUMBER: Final = re.compile(r"\s*[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 """The number with which a displayed text may begin, such as "22 °C"."""
 
 
-def jsonable(value: object) -> JSON:
+def jsonable(value: object) -> Any:
     """Return a value as JSON.
 
     Arrays become lists. Numbers that are not finite, and objects, become texts.
     """
-    match value:
-        case np.ndarray() | np.generic():
-            return jsonable(value.tolist())
-        case Mapping():
-            return {str(key): jsonable(part) for key, part in value.items()}
-        case list() | tuple():
-            return [jsonable(part) for part in value]
-        case float() if not isfinite(value):
-            return str(value)
-        case str() | int() | float() | None:
-            return value
-        case _:
-            return short_repr(value)
+    text = json.dumps(as_json(value))
+    return json.loads(text, parse_constant=lambda name: str(float(name)))
 
 
 def shown(value: object) -> str:
     """Return a value as a text for people. Fractions have four digits."""
+    if isinstance(value, np.generic):
+        value = value.item()
     match value:
-        case bool() | np.bool():
+        case bool():
             return "yes" if value else "no"
-        case str():
-            return value
-        case float() if isfinite(value) and value != round(value):
-            digits = float(f"{value:.4g}")
-            return f"{value:.0f}" if abs(value) >= 10_000 else f"{digits:g}"
-        case float() if isfinite(value) and abs(value) < 1e15:
-            return str(int(value))
-        case Mapping():
-            return ", ".join(f"{key} {shown(part)}" for key, part in value.items())
-        case list() | tuple():
-            return ", ".join(map(shown, value))
-        case np.ndarray() | np.generic():
-            return shown(value.tolist())
+        case float() if 1_000 <= abs(value) < 1e15:
+            return f"{value:.0f}"
+        case float():
+            return f"{value + 0.0:.4g}"  # without the sign of -0.0
         case _:
             return str(value)
 
@@ -93,7 +86,6 @@ def pending_decision(decision: Decision) -> Message:
         "number": decision.number,
         "time": jsonable(decision.time),
         "question": decision.question,
-        "reward": jsonable(decision.reward),
         "situation": situation_of(decision),
         "displayed": decision.display is not None,
         "form": form_of(decision.action_space, decision.mask, decision.action_labels),
@@ -102,230 +94,138 @@ def pending_decision(decision: Decision) -> Message:
 
 
 def situation_of(decision: Decision) -> list[Message]:
-    """Return the situation of a decision: its display, or else its observation.
-
-    Each entry has its label, its text, and its number or None.
-    """
-    return _entries(situation(decision))
+    """Return the first entries of the situation of a decision."""
+    return entries_of(situation(decision))
 
 
-def entries_of(
-    observation: Observation,
-    labels: Labels = None,
-) -> list[Message]:
-    """Return the first entries of an observation."""
-    return _entries(labelled(observation, labels))
+def entries_of(value: JSON) -> list[Message]:
+    """Return the first entries of a situation: label, text, and the number or None."""
+    return [*islice(_entries(value), MOST_ENTRIES)]
 
 
-def _entries(value: JSON) -> list[Message]:
-    return [_entry(label, part) for label, part in islice(_parts(value), MOST_ENTRIES)]
-
-
-def _parts(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
+def _entries(value: JSON, name: str = "") -> Iterator[Message]:
     match value:
         case Mapping():
             for key, part in value.items():
-                yield from _parts(part, f"{name} {key}".strip())
+                yield from _entries(part, f"{name} {key}".strip())
         case list():
             for place, part in enumerate(value):
-                yield from _parts(part, f"{name}[{place}]")
+                yield from _entries(part, f"{name}[{place}]")
         case _:
-            yield name or "value", value
-
-
-def _entry(label: str, value: object) -> Message:
-    number: float | None = None
-    if isinstance(value, str):
-        begin = NUMBER.match(value)
-        number = float(begin[0]) if begin else None
-    elif isinstance(value, (int, float)) and not isinstance(value, bool) and -inf < value < inf:
-        number = value
-    return {"label": label, "text": shown(value), "number": number}
+            begin = NUMBER.match(str(value))
+            number = float(begin[0]) if begin else None
+            yield {"label": name or "value", "text": shown(value), "number": number}
 
 
 # -- answers --------------------------------------------------------------------------------------
 
 
 def form_of(
-    space: Space[Any],
+    space: Space,
     mask: Mask | None,
     labels: Labels,
 ) -> Message:
     """Describe the answers to a decision as JSON, for the inputs of the page.
 
     A ``Discrete`` has ``cards``: its legal actions with their labels. All other spaces have
-    ``fields``, and an ``answer``: the JSON of an action, with the index of a field in place of
-    each value.
+    ``fields``: their names, and the ``path`` of their values in the JSON of an action. A field has
+    ``options``, or it is a JSON schema with a ``hint``, or any ``json``.
     """
-    if isinstance(space, Discrete) and _are_few(space, mask):
-        return {"cards": _options(space, mask, labels)}
-    fields: list[Message] = []
-    return {"answer": _answer(space, mask, labels, "", fields), "fields": fields}
+    fields = [*_fields(space, mask, labels)]
+    is_card = isinstance(space, Discrete) and "options" in fields[0]
+    return {"cards": fields[0]["options"]} if is_card else {"fields": fields}
 
 
-def _are_few(space: Discrete, mask: Mask | None) -> bool:
-    """Return whether the legal actions can be shown one by one."""
-    number = space.n if mask is None else np.count_nonzero(mask)
-    return int(number) <= MOST_ANSWERS
-
-
-def _options(
-    space: Discrete,
-    mask: Mask | None,
-    labels: Labels,
-) -> list[Message]:
-    names = labels if isinstance(labels, Mapping) else {}
-    return [
-        {"action": action, "text": shown(names.get(action, action))}
-        for action in legal_actions(space, mask)
-    ]
-
-
-def _answer(
-    space: Space[Any],
+def _fields(
+    space: Space,
     mask: Any,
-    labels: Any,
-    name: str,
-    fields: list[Message],
-) -> JSON:
-    """Add the fields of a space, and return its answer."""
-
-    def part(
-        key: Any,
-        space: Space[Any],
-        label: str,
-    ) -> JSON:
+    labels: Labels,
+    name: str = "",
+    path: tuple[Any, ...] = (),
+) -> Iterator[Message]:
+    parts = components_of(space, labels)
+    if not 0 < prod(space.shape or [len(parts)]) <= MOST_ENTRIES:
+        yield {"name": name, "path": [*path], **_input_of(space, mask, labels)}
+        return
+    for key, label, part in parts:
+        if label == str(key) and not isinstance(space, Dict):  # which says no more than a number
+            label = f"Part {key + 1}" if len(parts) > 1 else ""
         inner = None if mask is None else mask[key]
-        return _answer(space, inner, None, f"{name} {label}".strip(), fields)
+        yield from _fields(part, inner, None, f"{name} {label}".strip(), (*path, key))
 
+
+def _input_of(
+    space: Space,
+    mask: Any,
+    labels: Labels,
+) -> Message:
     match space:
-        case Discrete() if _are_few(space, mask):
-            return _add(fields, name, options=_options(space, mask, labels))
-        case Discrete() if mask is None:
-            last = int(space.start + space.n - 1)
-            return _add_number(fields, name, int(space.start), last)
-        case Box() if 0 < space.low.size <= MOST_ENTRIES:
-            names = _names(labels, space.low.size)
-            bounds = zip(names, space.low.ravel(), space.high.ravel(), strict=True)
-            return [
-                _add_number(fields, f"{name} {label}".strip(), low.item(), high.item())
-                for label, low, high in bounds
-            ]
-        case MultiDiscrete(shape=(size,)) if size <= MOST_ENTRIES:
-            names = _names(labels, size)
-            return [part(place, space[place], names[place]) for place in range(size)]
-        case MultiBinary(shape=(size,)) if size <= MOST_ENTRIES:
-            names = _names(labels, size)
-            return [part(place, Discrete(2), names[place]) for place in range(size)]
-        case Dict() if all(isinstance(key, str) for key in space):
-            texts = labels if isinstance(labels, Mapping) else {}
-            return {key: part(key, inner, texts.get(key, key)) for key, inner in space.items()}
-        case Tuple():
-            names = _names(labels, len(space))
-            return [part(place, space[place], names[place]) for place in range(len(space))]
+        case Discrete() if (space.n if mask is None else np.sum(mask)) <= MOST_ANSWERS:
+            legal = legal_actions(space, mask)
+            texts = [shown(label_of_part(labels, action)) for action in legal]
+            pairs = zip(legal, texts, strict=True)
+            return {"options": [{"action": action, "text": text} for action, text in pairs]}
         case Text():
-            return _add(fields, name, longest=space.max_length)
-        case _:
-            return _add(fields, name, json=short_repr(space))
-
-
-def _names(labels: Any, size: int) -> list[str]:
-    """Return the labels of the parts of an array. Those that say no more than a number go."""
-    names = [str(label) for label in labels or range(size)]
-    if names == ["0"]:
-        return [""]
-    return [f"Part {place + 1}" if name == str(place) else name for place, name in enumerate(names)]
-
-
-def _add(fields: list[Message], name: str, **field: JSON) -> int:
-    fields.append({"name": name, **field})
-    return len(fields) - 1
-
-
-def _add_number(
-    fields: list[Message],
-    name: str,
-    low: float,
-    high: float,
-) -> int:
-    whole = isinstance(low, int)
-    hint = "a whole number" if whole else "a number"
-    ends = [shown(end) for end in (low, high)]
-    bounded = isfinite(low), isfinite(high)
-    match bounded:
-        case True, True:
-            hint += f" from {ends[0]} to {ends[1]}"
-        case True, False:
-            hint += f" of at least {ends[0]}"
-        case False, True:
-            hint += f" of at most {ends[1]}"
-    limits = [end if isfinite(end) else None for end in (low, high)]
-    return _add(fields, name, low=limits[0], high=limits[1], whole=whole, hint=hint)
+            return {"maxLength": space.max_length, "hint": f"at most {space.max_length} characters"}
+        case Discrete() | Box(shape=()) if mask is None:
+            schema = schema_of(space, None)
+            return schema | {"hint": limits_of(schema)}
+    return {"json": short_repr(space)}
 
 
 def words_of(form: Message, action: Action) -> str:
     """Return an action, given as JSON, in the words of its decision."""
-    for card in form.get("cards", ()):
-        if card["action"] == action:
-            return str(card["text"])
     words = []
-    for field, value in _filled(form, action):
-        texts = [each["text"] for each in field.get("options", ()) if each["action"] == value]
-        text = texts[0] if texts else shown(value)
-        words.append(f"{field['name']}: {text}" if field["name"] else text)
-    return ", ".join(words) or short_repr(action)
+    for field in form.get("fields") or [{"name": "", "path": (), "options": form["cards"]}]:
+        value = _value_at(action, field["path"])
+        options = field.get("options", ())
+        texts = [option["text"] for option in options if option["action"] == value]
+        words.append(": ".join(filter(None, [field["name"], *(texts or [shown(value)])])))
+    return ", ".join(words)
 
 
 def complaint_about(form: Message, action: Action) -> Message:
-    """Say what is wrong with an illegal action, at its field. An empty dict: it is not known."""
+    """Say what is wrong with an illegal action, as ``text``. An empty dict: it is not known."""
     if "cards" in form:
-        texts = ", ".join(card["text"] for card in form["cards"][:MOST_CANDIDATES])
+        texts = _texts(form["cards"][:MOST_CANDIDATES])
         return {"text": f"Choose one of these answers: {texts} (not {short_repr(action)})."}
-    for place, (field, value) in enumerate(_filled(form, action)):
-        problem = ""
-        if "options" in field and value not in [each["action"] for each in field["options"]]:
-            problem = f"Choose one of {', '.join(each['text'] for each in field['options'])}"
-        elif "hint" in field and not _fits(field, value):
-            problem = f"Enter {field['hint']}"
-        elif "longest" in field and len(str(value)) > field["longest"]:
-            problem = f"Enter at most {field['longest']} characters"
-        if problem:
+    for field in form["fields"]:
+        value = _value_at(action, field["path"])
+        if not _fits(field, value):
+            hint = f"Enter {field['hint']}" if "hint" in field else ""
+            problem = hint or f"Choose one of {_texts(field['options'])}"
             given = "" if value in ("", None) else f", not {short_repr(value, 60)}"
-            return {"field": place, "text": f"{problem}{given}."}
+            return {"text": f"{problem}{given}."}
     return {}
 
 
-def _fits(field: Message, value: object) -> bool:
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not -inf < value < inf:
-        return False
-    low, high = field["low"], field["high"]
-    is_low = low is not None and value < low
-    is_high = high is not None and value > high
-    return not (is_low or is_high or (field["whole"] and value != round(value)))
+def _texts(options: list[Message]) -> str:
+    return ", ".join(option["text"] for option in options)
 
 
-def _filled(form: Message, action: Action) -> list[tuple[Message, Any]]:
-    """Return the fields of an action with their values. Without a value, it is None."""
-    values = dict(_leaves(form.get("answer"), action))
-    return [(field, values.get(place)) for place, field in enumerate(form.get("fields", ()))]
+def _fits(field: Message, value: Any) -> bool:
+    match field:
+        case {"options": options}:
+            return value in [option["action"] for option in options]
+        case {"maxLength": longest}:
+            return bool(len(str(value)) <= longest)
+        case {"type": kind}:
+            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not is_number or (kind == "integer" and value % 1):
+                return False
+            return bool(field.get("minimum", -inf) <= value <= field.get("maximum", inf))
+    return True
 
 
-def _leaves(answer: JSON, action: Action) -> Iterator[tuple[int, Any]]:
-    match answer, action:
-        case Mapping(), Mapping():
-            for key, part in answer.items():
-                yield from _leaves(part, action.get(key))
-        case list(), list() if len(answer) == len(action):
-            for inner, value in zip(answer, action, strict=True):
-                yield from _leaves(inner, value)
-        case list(), _ if len(answer) == 1 and not isinstance(action, (list, Mapping)):
-            yield from _leaves(answer[0], action)
-        case int(index), _:
-            yield index, action
+def _value_at(action: Action, path: Iterable[Any]) -> Any:
+    """Return the value of a field in the JSON of an action; None if it has none."""
+    with suppress(TypeError, LookupError):
+        return reduce(getitem, path, action)
+    return None
 
 
 def candidates_of(
-    space: Space[Any],
+    space: Space,
     form: Message,
 ) -> list[Action]:
     """Return actions to try out, as JSON.
@@ -336,13 +236,12 @@ def candidates_of(
     if "cards" in form:
         return [card["action"] for card in form["cards"][: MOST_CANDIDATES - 1]]
     if isinstance(space, Box) and space.low.size == 1 and space.is_bounded():
-        grid = np.linspace(space.low.ravel(), space.high.ravel(), 5)
-        actions = np.unique(grid.astype(space.dtype), axis=0)
-        return [*actions.tolist()]
+        grid = np.linspace(space.low, space.high, 5).astype(space.dtype)
+        return [*np.unique(grid, axis=0).tolist()]
     return []
 
 
-def action_of(space: Space[Any], value: Action) -> Action:
+def action_of(space: Space, value: Action) -> Action:
     """Return the action for its JSON; ``RULE`` for None.
 
     A value that does not fit is returned as it is, so that the environment refuses it.
@@ -368,8 +267,6 @@ def picture_of(env: SimulationAECEnv) -> Message | None:
             return None
         case np.ndarray(dtype=np.uint8, shape=(_, _, 3)) if rendered.size:
             return {"png": b64encode(_png(rendered)).decode()}
-        case np.ndarray():
-            return {"text": f"an array of shape {rendered.shape}"}
         case _:
             return {"text": str(rendered)[:LONGEST_TEXT]}
 

@@ -12,11 +12,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ... import clone
+from ...core import Info
 from ...envs import SimulationAECEnv
 from ...errors import BranchError, describe_error
 from ...simulation import Action
-from ..descriptions import at_decision
-from .deciders import Deciders
+from ..descriptions import at_decision, labelled
 from .forms import (
     MOST_CANDIDATES,
     Message,
@@ -27,6 +27,7 @@ from .forms import (
     situation_of,
     words_of,
 )
+from .game import Game
 
 FUTURES: Final = 16
 """The number of futures that try out each candidate."""
@@ -46,23 +47,22 @@ DECISIONS: Final = 8
 TIME_LIMIT: Final = 30.0
 """The time limit of each operation in a future, in seconds."""
 
-Course = list[list[float]]
-"""A row for each decision of the agent in a future: time, return since now, and measures."""
+Course = list[list[Any]]
+"""A row for each decision of the agent in a future: time, return since now, and measures.
+
+A measure that is not there is None.
+"""
 
 
 class Exploration:
-    """Work in clones of an environment. It can be abandoned while a clone computes."""
+    """Work in clones of an environment. It can be abandoned while a clone computes, and go on."""
 
-    is_abandoned = False
-
-    def __init__(
-        self,
-        env: SimulationAECEnv,
-        deciders: Deciders,
-    ) -> None:
-        """Explore from the pending decision of an environment on."""
+    def __init__(self, env: SimulationAECEnv, game: Game) -> None:
+        """Explore from the pending decision of an environment on, at this moment of a game."""
         self.env = env
-        self._deciders = deciders
+        self.moment = game.moment
+        self.is_abandoned = False
+        self._deciders = game.deciders
         self._lock = Lock()
         self._process: int | None = None
         self._thread: Thread | None = None
@@ -90,11 +90,12 @@ class Exploration:
             self._thread.start()
 
     def abandon(self) -> None:
-        """End the exploration at once, also if a clone computes."""
+        """End the exploration at once, also if a clone computes. It goes on when it is started."""
         self.is_abandoned = True
         self._kill()
-        if self._thread is not None:
-            self._thread.join()
+        self.wait()
+        self._thread = None
+        self.is_abandoned = False
 
     def wait(self) -> None:
         """Wait for the end of the exploration."""
@@ -123,11 +124,20 @@ class Exploration:
                 os.kill(self._process, signal.SIGKILL)
                 self._process = None
 
-    def _answer(self, twin: SimulationAECEnv) -> Action:
-        """Return the action of an agent in a future: by its policy, or by the rule."""
-        agent = twin.agent_selection
-        answer = self._deciders.answer(twin, future=True)
-        return action_of(twin.action_space(agent), answer)
+    def _follow(self, twin: SimulationAECEnv) -> Iterator[tuple[str, float, bool, Info]]:
+        """Go on in a clone, by policies and the rule.
+
+        Yields:
+            Each agent that decides or has ended: its name, the reward of its previous decision,
+            whether it has ended, and its info.
+        """
+        while twin.agents:
+            agent = twin.agent_selection
+            _, reward, terminated, truncated, info = twin.last(observe=False)
+            ended = terminated or truncated
+            yield agent, reward, ended, info
+            answer = None if ended else self._deciders.answer(twin, future=True)
+            twin.step(None if ended else action_of(twin.action_space(agent), answer))
 
 
 # -- the candidates for a decision ----------------------------------------------------------------
@@ -146,27 +156,24 @@ class Horizon:
 
     Attributes:
         by_time: Whether it is a time, else a number of the agent's decisions.
-        time: The time. None: that of the first future's ``DECISIONS`` decisions.
-        decisions: The number of decisions.
+        length: The time or the number. None: the time of the first future's ``DECISIONS``
+            decisions.
     """
 
     by_time: bool = True
-    time: float | None = None
-    decisions: int = DECISIONS
-
-    def set(self, by_time: bool, length: float) -> None:
-        """Look so far ahead from now on."""
-        self.by_time = by_time
-        if by_time:
-            self.time = length
-        else:
-            self.decisions = int(length)
+    length: float | None = None
 
     def learn(self, span: float) -> None:
         """Take the time of a future, rounded down to one digit."""
-        if self.time is None and span > 0:
+        if self.by_time and self.length is None and span > 0:
             unit = 10.0 ** floor(log10(span))
-            self.time = float(f"{floor(span / unit) * unit:.0e}")
+            self.length = float(f"{floor(span / unit) * unit:.0e}")
+
+    def is_reached(self, decisions: int, span: float) -> bool:
+        """Return whether a future has gone as far."""
+        if self.by_time and self.length is not None:
+            return span >= self.length or decisions >= MOST_DECISIONS
+        return decisions >= (self.length or DECISIONS)
 
 
 class Futures(Exploration):
@@ -175,7 +182,7 @@ class Futures(Exploration):
     Attributes:
         pending: The pending decision as JSON.
         candidates: The candidates. The first one is the rule.
-        measures: The labels of the numbers of the situation, by their places in it.
+        measures: The places of the numbers in the situation.
         rule_action: The part of the message with the action of the rule, once it is known.
         note: A remark for the page.
     """
@@ -183,69 +190,60 @@ class Futures(Exploration):
     def __init__(
         self,
         env: SimulationAECEnv,
-        deciders: Deciders,
+        game: Game,
         pending: Message,
         horizon: Horizon,
-        seed: int,
     ) -> None:
         """Find the candidates and the measures.
 
         Args:
             env: The environment whose decision is pending.
-            deciders: The policies of other agents.
-            pending: The decision as JSON, with its ``moment``.
-            horizon: How far the futures go.
-            seed: The seed from which the futures draw theirs.
+            game: The game, with the policies of other agents.
+            pending: The decision as JSON.
+            horizon: How far the futures go, where the simulation has a time.
         """
-        super().__init__(env, deciders)
+        super().__init__(env, game)
         self.pending = pending
         self.note = ""
-        self._horizon = horizon
-        self._seed = seed
-        self._agent: str = pending["agent"]
-        self._space = env.action_space(self._agent)
-        self._by_time = horizon.by_time and pending["time"] is not None
-        self._start: float = pending["time"] if self._by_time else 0.0
+        has_time = pending["time"] is not None or not horizon.by_time
+        self._horizon = horizon if has_time else Horizon(by_time=False)
+        self._start: float = pending["time"] if self._horizon.by_time else 0.0
+        self._seed = game.seed * 1_000_003 + pending["number"] * 1009
+        self._space = env.action_space(pending["agent"])
         actions = [None, *candidates_of(self._space, pending["form"])]
         self.candidates = [Candidate(action, []) for action in actions]
-        self.measures: dict[int, str] = {}
-        for place, entry in enumerate(pending["situation"]):
-            if entry["number"] is not None and len(self.measures) < MOST_MEASURES:
-                self.measures[place] = entry["label"]
-        self._first = [self._start, 0.0, *self._numbers(pending["situation"])]
+        situation = pending["situation"]
+        numbers = [place for place, entry in enumerate(situation) if entry["number"] is not None]
+        self.measures = numbers[:MOST_MEASURES]
         self.rule_action: Message = {}
 
     def add(self, action: Action) -> None:
-        """Add a legal candidate, as JSON."""
+        """Add a legal candidate, as JSON, to futures that were abandoned."""
         actions = [candidate.action for candidate in self.candidates]
         if len(actions) < MOST_CANDIDATES and action not in actions:
             self.candidates.append(Candidate(action, []))
-
-    def resumed(self, env: SimulationAECEnv) -> "Futures":
-        """Return an exploration with the same candidates and their courses."""
-        other = Futures(env, self._deciders, self.pending, self._horizon, self._seed)
-        other.candidates[:] = self.candidates
-        other.rule_action |= self.rule_action
-        return other
 
     def explore(self) -> Iterator[Message | None]:
         """Try out the candidates.
 
         Yields:
-            None after each step of a simulation, and a message for the page after each future.
+            None after each step of a simulation, and a message for the page after each round.
         """
         yield self.message(is_over=False)
         seeds = self._seeds()
-        for place, seed in enumerate(seeds):
-            for candidate in self.candidates:
-                if len(candidate.courses) == place and not self.is_abandoned:
-                    yield from self._play(candidate, seed)
-            yield self.message(is_over=place == len(seeds) - 1)
+        while not self.is_abandoned:
+            behind = min(self.candidates, key=lambda candidate: len(candidate.courses))
+            place = len(behind.courses)
+            if place == len(seeds):
+                yield self.message(is_over=True)
+                return
+            yield from self._play(behind, seeds[place])
+            if behind is self.candidates[-1]:
+                yield self.message(is_over=False)
 
     def _seeds(self) -> list[int] | list[None]:
         """Return the seeds of the futures; None for the future of the episode itself."""
-        first = self._seed * 1_000_003 + self.pending["number"] * 1009
-        seeds = [(first + place) % 2**31 for place in range(FUTURES)]
+        seeds = [(self._seed + place) % 2**31 for place in range(FUTURES)]
         try:
             clone(self.env, seed=seeds[0]).close()
         except Exception as error:
@@ -255,66 +253,47 @@ class Futures(Exploration):
 
     def _play(self, candidate: Candidate, seed: int | None) -> Iterator[None]:
         """Play a future, and add its course to the candidate. Yield after each step."""
-        course = [self._first]
+        own = self.pending["agent"]
+        course: Course = [[self._start, 0.0, *self._numbers(self.pending["situation"])]]
         try:
             with self._twin(seed) as twin:
                 twin.step(action_of(self._space, candidate.action))
-                while twin.agents:
-                    is_agent = twin.agent_selection == self._agent
-                    _, reward, terminated, truncated, info = twin.last(observe=False)
-                    ended = terminated or truncated
-                    if is_agent:
-                        course.append(self._row(twin, course[-1], reward, ended))
+                for agent, reward, ended, info in self._follow(twin):
+                    time, total, *numbers = course[-1]
+                    if agent == own:
+                        time = info.get("time", time) if self._horizon.by_time else time + 1
+                        if not (ended and self.pending["displayed"]):
+                            numbers = self._numbers(self._situation(twin))
+                        course.append([time, total + reward, *numbers])
                         if candidate.action is None and "rule_action" in info:
-                            self._note_rule(jsonable(info["rule_action"]))
-                        if ended or self._is_far(len(course) - 1, course[-1][0]):
-                            break
-                    elif self._by_time and self._is_far(0, info.get("time", self._start)):
+                            self._note_rule(info["rule_action"])
+                    span = info.get("time", self._start) - self._start
+                    is_far = self._horizon.is_reached(len(course) - 1, span)
+                    if is_far or (agent == own and ended):
                         break
                     yield
-                    twin.step(None if ended else self._answer(twin))
         except Exception as error:
             if not self.is_abandoned:
                 self.note = f"A future has failed: {describe_error(error)[:300]}"
-        if self.is_abandoned:
-            return
-        if self._by_time:
+        if not self.is_abandoned:
             self._horizon.learn(course[-1][0] - self._start)
-        candidate.courses.append(course)
-
-    def _is_far(self, decisions: int, time: float) -> bool:
-        """Return whether a future has gone as far as the horizon."""
-        horizon = self._horizon
-        if self._by_time and horizon.time is not None:
-            return time >= self._start + horizon.time or decisions >= MOST_DECISIONS
-        return decisions >= horizon.decisions
+            candidate.courses.append(course)
 
     def _note_rule(self, action: Action) -> None:
-        words = words_of(self.pending["form"], action)
-        self.rule_action = self.rule_action or {"rule": action, "rule_words": words}
+        if not self.rule_action:
+            rule = jsonable(action)
+            self.rule_action = {"rule": rule, "rule_words": words_of(self.pending["form"], rule)}
 
-    def _row(
-        self,
-        twin: SimulationAECEnv,
-        before: list[float],
-        reward: float,
-        ended: bool,
-    ) -> list[float]:
-        """Return the row of the agent's decision, or of its end."""
-        info = twin.infos[self._agent]
-        time = info.get("time", before[0]) if self._by_time else before[0] + 1
-        if not self.pending["displayed"]:
-            situation = entries_of(twin.observe(self._agent))
-        elif ended:
-            return [time, before[1] + reward, *before[2:]]
-        else:
-            situation = at_decision(twin, "play", situation_of)
-        return [time, before[1] + reward, *self._numbers(situation)]
+    def _situation(self, twin: SimulationAECEnv) -> list[Message]:
+        """Return the situation of the agent in a future, in which it may have ended."""
+        if self.pending["displayed"]:
+            entries: list[Message] = at_decision(twin, "play", situation_of)
+            return entries
+        return entries_of(labelled(twin.observe(self.pending["agent"])))
 
-    def _numbers(self, situation: list[Message]) -> list[float]:
-        numbers = dict(enumerate(entry["number"] for entry in situation))
-        found = [numbers.get(place) for place in self.measures]
-        return [float("nan") if number is None else float(number) for number in found]
+    def _numbers(self, situation: list[Message]) -> list[float | None]:
+        numbers = {place: entry["number"] for place, entry in enumerate(situation)}
+        return [numbers.get(place) for place in self.measures]
 
     def message(self, *, is_over: bool) -> Message:
         """Return the message for the page.
@@ -322,8 +301,8 @@ class Futures(Exploration):
         Its ``bands`` have, for each measure, the lower end of the 80 % band, the median and the
         upper end, at points from now to the horizon.
         """
-        horizon = self._horizon
-        length = horizon.time if self._by_time else horizon.decisions
+        by_time = self._horizon.by_time
+        length = self._horizon.length or (None if by_time else DECISIONS)
         points = np.linspace(0, length or 0, POINTS + 1) + self._start
         candidates = []
         for action, courses in self.candidates:
@@ -333,16 +312,15 @@ class Futures(Exploration):
             if sampled:
                 quantiles = np.quantile(sampled, (0.1, 0.5, 0.9), axis=0)
                 bands = quantiles.transpose(2, 0, 1).round(6)
-            candidates.append(
-                {"action": action, "words": words, "n": len(courses), "bands": jsonable(bands)}
-            )
+            candidates.append({"action": action, "words": words, "n": len(courses), "bands": bands})
+        labels = [self.pending["situation"][place]["label"] for place in self.measures]
         return {
             "type": "fan",
             "turn": self.pending["turn"],
-            "moment": self.pending["moment"],
+            "moment": self.moment,
             "horizon": length,
-            "by_time": self._by_time,
-            "measures": ["your points", *self.measures.values()],
+            "by_time": by_time,
+            "measures": ["your points", *labels],
             "candidates": candidates,
             "done": is_over,
             "note": self.note,
@@ -352,7 +330,7 @@ class Futures(Exploration):
 
 def _sampled(course: Course, points: Any) -> Any:
     """Return the returns and measures of a course at points. An ended course stays as it is."""
-    rows = np.nan_to_num(np.array(course), nan=0.0, posinf=1e12, neginf=-1e12)
+    rows = np.nan_to_num(np.array(course, float), nan=0.0, posinf=1e12, neginf=-1e12)
     return np.stack([np.interp(points, rows[:, 0], column) for column in rows.T[1:]], axis=1)
 
 
@@ -365,44 +343,32 @@ class Comparison(Exploration):
     def __init__(
         self,
         env: SimulationAECEnv,
-        deciders: Deciders,
+        game: Game,
         returns: dict[str, float],
-        moment: int,
     ) -> None:
         """Compare from the first decision of a person on.
 
         Args:
             env: The environment at that decision.
-            deciders: The policies of other agents.
+            game: The game, with the policies of other agents.
             returns: The returns until then.
-            moment: The moment of the game, for the page.
         """
-        super().__init__(env, deciders)
-        self._totals = {**returns}
-        self._courses = {agent: [total] for agent, total in returns.items()}
-        self._moment = moment
+        super().__init__(env, game)
+        self._returns = returns
 
     def explore(self) -> Iterator[Message | None]:
         """Play the episode to its end, and yield a message with the totals and their courses."""
         note = ""
+        courses = {agent: [total] for agent, total in self._returns.items()}
         try:
             with self._twin(None) as twin:
-                first = True
-                while twin.agents:
-                    agent = twin.agent_selection
-                    _, reward, terminated, truncated, _ = twin.last(observe=False)
-                    if not first:
-                        self._totals[agent] = self._totals.get(agent, 0.0) + reward
-                        self._courses.setdefault(agent, [0.0]).append(self._totals[agent])
-                    first = False
+                for place, (agent, reward, _, _) in enumerate(self._follow(twin)):
+                    if place:
+                        course = courses.setdefault(agent, [0.0])
+                        course.append(course[-1] + reward)
                     yield None
-                    twin.step(None if terminated or truncated else self._answer(twin))
         except Exception as error:
             note = f"The rule's game has failed: {describe_error(error)[:300]}"
-        yield {
-            "type": "rule",
-            "moment": self._moment,
-            "totals": self._totals,
-            "courses": self._courses,
-            "note": note,
-        }
+        totals = {agent: course[-1] for agent, course in courses.items()}
+        message = {"totals": totals, "courses": courses, "note": note}
+        yield {"type": "rule", "moment": self.moment, **message}

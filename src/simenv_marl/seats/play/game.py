@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NotRequired, TypedDict
+from typing import Any, Final, NamedTuple
 
 from ... import aec_env, clone
-from ...core import EpisodeOptions, Points, Policy
+from ...core import EpisodeOptions, Point, Points, Policy
 from ...envs import SimulationAECEnv
 from ...errors import (
     InvalidActionError,
@@ -16,10 +16,11 @@ from ...errors import (
     did_you_mean,
 )
 from ...simulation import Action, Model
-from ..descriptions import at_decision
+from ..descriptions import JSON, at_decision
+from ..recordings import Lines
 from .deciders import Deciders
 from .forms import Message, action_of, jsonable, pending_decision, words_of
-from .recording import Episode, Recorder, read
+from .recording import Episode, follow, read
 
 CHECKPOINTS: Final = 24
 """The largest number of checkpoints. Each one is a process."""
@@ -31,27 +32,14 @@ REPEATED: Final = ("agent", "before", "seen", "time")
 """The keys of a decision that are the same when it is reached again."""
 
 
-class Row(TypedDict):
-    """A decision of the game, as JSON."""
+Row = Message
+"""A decision of the game: a pending decision as JSON, and further keys.
 
-    turn: int
-    agent: str
-    number: int
-    """The number of the decision among those of its agent, from 1."""
-    before: float
-    """The agent's return before the decision."""
-    seen: str
-    """The digest of the observation."""
-    time: float | None
-    situation: list[Message]
-    form: Message
-    action: NotRequired[Action]
-    """The action as JSON; None for the rule. A pending decision has none."""
-    by: NotRequired[str]
-    """Who decided: "person", "policy", "rule", or "limit" for the rule after the time limit."""
-    words: NotRequired[str]
-    """The action in the words of the decision. Of the rule, "" until its action is known."""
-    reward: NotRequired[float | None]
+``turn`` is its place in the timeline, and ``before`` the agent's return before it. Once it is
+taken, it has its ``action`` as JSON (None for the rule), its ``words`` ("" for an unknown action of
+the rule), its ``reward``, and who decided, ``by``: "person", "policy", "rule", or "limit" for the
+rule after the time limit.
+"""
 
 
 class Checkpoint(NamedTuple):
@@ -77,6 +65,7 @@ class Game:
         new: Whether to begin another episode instead.
         can_fork: Whether checkpoints can be made. Else the way back is a replay.
         checkpoints: The checkpoints, by turn.
+        episodes: The episodes, as the recording has them. The last one is played.
         resumed: Whether a recorded episode goes on.
         root: The environment that was made for the game.
         env: The environment at the pending decision: ``root`` or a clone.
@@ -84,11 +73,9 @@ class Game:
         timeline: The decisions, also those after the pending one that were undone.
         turn: The place of the pending decision in the timeline.
         moment: A number that each change of the pending decision increases.
-        now: The pending decision as JSON; None at the end.
         over: Why the episode is over: "terminated", "truncated" or an error. "": it is not.
         returns: The return of each agent so far.
         latest: The turn of the latest decision of each agent.
-        previous: The episode before the latest restart, until a decision is taken.
         notice: A warning for the page.
     """
 
@@ -101,8 +88,6 @@ class Game:
     options: EpisodeOptions = field(default_factory=EpisodeOptions)
     record: Path | None = None
     new: bool = False
-    can_fork: bool = True
-    checkpoints: dict[int, Checkpoint] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Begin an episode, or go on with the recorded one.
@@ -113,12 +98,19 @@ class Game:
         """
         self.root = self.env = self.make_env()
         self.deciders = Deciders(self.simulation, self.policies, self.points, self.options)
-        recorded = []
+        self.can_fork = True
+        self.checkpoints: dict[int, Checkpoint] = {}
+        self.timeline: list[Row] = []
+        self.turn = 0
+        self.moment = 0
+        self.returns: dict[str, float] = {}
+        self._unsaved: list[JSON] = []  # the lines that could not be written yet
+        self.episodes: list[Episode] = []
         if self.record is not None and self.record.exists() and not self.new:
-            recorded = read(self.record)
-        self.resumed = bool(recorded)
-        if recorded and not self.seats:
-            self.seats = recorded[-1].header.get("seats", ())
+            self.episodes = read(self.record)
+        self.resumed = bool(self.episodes)
+        if self.resumed and not self.seats:
+            self.seats = self.episodes[-1].header.get("seats", ())
         roster = self.root.session.plan.roster
         agents: list[str] = getattr(self.root, "possible_agents", [])
         for seat in set(self.seats).difference(agents or self.seats):
@@ -128,21 +120,23 @@ class Game:
         self.agents: dict[str, str] = {}
         named = [key for key in self.policies if isinstance(key, str) and "." not in key]
         for agent in dict.fromkeys([*self.seats, *agents, *named]):
-            point = roster.get(agent)
-            self._meet(agent, "" if point is None else point.hook.name)
-        self.recorder = None if self.record is None else Recorder(self.record)
-        self.previous: Episode | None = None
-        self.timeline: list[Row] = []
-        self.turn = 0
-        self.moment = 0
-        self.now: Message | None = None
-        if recorded:
-            self._resume(recorded)
+            self._meet(agent, roster.get(agent))
+        if self.resumed:
+            self._resume()
         else:
             self.restart(self.seed)
-            self.previous = None
-        if self.notice or (self.over and not recorded):
+        if self.notice or (self.over and not self.resumed):
             raise OptionValueError(f"{self.name} cannot be played: {self.over or self.notice}")
+
+    @property
+    def now(self) -> Row | None:
+        """The pending decision; None at the end."""
+        return None if self.over else self.timeline[self.turn]
+
+    @property
+    def can_go_back(self) -> bool:
+        """Whether nothing was decided since a restart."""
+        return len(self.episodes) > 1 and not self.episodes[-1].decisions
 
     def make_env(self) -> SimulationAECEnv:
         """Make an environment of the game's simulation."""
@@ -155,6 +149,11 @@ class Game:
         """Return whether the agent's seat is for a person."""
         return agent in self.seats if self.seats else not self.agents.get(agent)
 
+    def turns_of(self, seat: str) -> list[int]:
+        """Return the turns of a seat; for "", the facilitator, those of all people."""
+        is_own = (lambda agent: agent == seat) if seat else self.plays
+        return [row["turn"] for row in self.timeline if is_own(row["agent"])]
+
     def close(self) -> None:
         """Close all environments."""
         self.forget(-1)
@@ -165,17 +164,13 @@ class Game:
 
     def restart(self, seed: int) -> None:
         """Begin another episode. ``go_back`` returns to the present one."""
-        lines = [line_of(row) for row in self.timeline if "action" in row]
-        self.previous = Episode(self._header(), lines, self.turn)
         self._begin(seed)
         self._record(self._header())
 
     def go_back(self) -> None:
         """Return to the episode before the latest restart."""
-        if self.previous is not None:
-            previous, self.previous = self.previous, None
-            self._load(previous)
-            self._record({"back": True, "turn": self.turn})
+        self._record({"back": True})
+        self._load()
 
     def _header(self) -> Message:
         header: Message = {"simulation": self.name, "seed": self.seed, "seats": list(self.seats)}
@@ -191,45 +186,58 @@ class Game:
         self.timeline = []
         self._return_to(0)
 
-    def _resume(self, episodes: list[Episode]) -> None:
+    def _resume(self) -> None:
         """Go on with the last recorded episode.
 
         Raises:
             OptionValueError: The simulation does not repeat it.
         """
-        latest = episodes[-1]
         problem = f"the recording {self.record} cannot be resumed"
         remedy = "begin another game by --new, or use another file"
         header = self._header()
         for key in ("simulation", "skip_forced", "max_steps"):
-            recorded, present = latest.header.get(key), header.get(key)
+            recorded, present = self.episodes[-1].header.get(key), header.get(key)
             if str(recorded).replace(":", ".") != str(present).replace(":", "."):
                 raise OptionValueError(
                     f"{problem}: its {key} is {recorded}, not {present}; {remedy}"
                 )
         try:
-            self._load(latest)
+            self._load()
         except InvalidActionError as error:
             raise OptionValueError(f"{problem}: {error}; {remedy}") from error
-        if len(episodes) > 1 and not latest.decisions:
-            self.previous = episodes[-2]
 
-    def _load(self, episode: Episode) -> None:
-        """Repeat the decisions of an episode.
+    def _load(self) -> None:
+        """Repeat the decisions of the last episode.
 
         Raises:
             InvalidActionError: The simulation does not repeat it.
         """
+        episode = self.episodes[-1]
         self._begin(episode.header["seed"])
         for line in episode.decisions:
-            row = None if self.now is None else self.timeline[self.turn]
-            if row is None or (row["agent"], row["seen"]) != (line["agent"], line["seen"]):
+            row = self.now
+            if row is None or any(row[key] != line[key] for key in ("agent", "seen")):
                 raise InvalidActionError(
                     f"the simulation does not repeat decision {line['turn']} of {line['agent']}"
                 )
             self._take(line["action"], line["by"])
         if episode.turn != self.turn:
             self._go_to(episode.turn)
+
+    def _record(self, line: Message) -> None:
+        """Add a line to the episodes and their file, with those that could not be written before.
+
+        The file is closed in between: clones need not copy it.
+        """
+        follow(self.episodes, line)
+        if self.record is None:
+            return
+        self._unsaved.append(jsonable(line))
+        try:
+            Lines(self.record).append(*self._unsaved)
+            self._unsaved.clear()
+        except OSError as error:
+            self.notice = f"The recording {self.record} cannot be written: {error}"
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -243,8 +251,8 @@ class Game:
         Raises:
             InvalidActionError: The action is not legal. The decision stays pending.
         """
-        line = line_of(self._take(action, by))
-        self.previous = None
+        row = self._take(action, by)
+        line = {key: value for key, value in row.items() if key in RECORDED}
         if self.over:
             line |= {"end": self.over, "returns": self.returns}
             absent = [seat for seat in self.seats if seat not in self.latest]
@@ -256,20 +264,15 @@ class Game:
 
     def answer(self) -> None:
         """Take the pending decision by the policy of its agent, or else by the rule."""
-        row = self.timeline[self.turn]
-        action: Action = None
-        by = "rule"
-        if self.agents.get(row["agent"]):
-            by = "policy"
-            try:
-                action = self.deciders.answer(self.env)
-            except Exception as error:
-                self._fail(f"the policy of {row['agent']} has failed: {describe_error(error)}")
-                return
+        agent = self.timeline[self.turn]["agent"]
+        is_policy = bool(self.agents[agent])
         try:
-            self.decide(action, by)
+            action = self.deciders.answer(self.env) if is_policy else None
+            self.decide(action, "policy" if is_policy else "rule")
         except InvalidActionError as error:
-            self._fail(f"the policy of {row['agent']} has answered illegally: {error}")
+            self._fail(f"the policy of {agent} has answered illegally: {error}")
+        except Exception as error:
+            self._fail(f"the policy of {agent} has failed: {describe_error(error)}")
 
     def _take(self, action: Action, by: str) -> Row:
         row = self.timeline[self.turn]
@@ -282,8 +285,7 @@ class Game:
         return row
 
     def _step(self, agent: str, action: Action) -> None:
-        space = self.env.action_space(agent)
-        self._attempt(self.env.step, action_of(space, action))
+        self._attempt(self.env.step, action_of(self.env.action_space(agent), action))
 
     def _attempt(self, function: Callable[..., Any], *args: object) -> Any:
         """Call a function of the environment; an error ends the episode.
@@ -301,7 +303,6 @@ class Game:
 
     def _fail(self, problem: str) -> None:
         self.over = problem
-        self.now = None
         self.moment += 1
 
     # -- the way back -----------------------------------------------------------------------------
@@ -309,11 +310,10 @@ class Game:
     def jump(self, turn: int) -> None:
         """Go to the end, or to the latest decision of a person up to a turn."""
         before = self.turn
-        if turn < len(self.timeline) or "action" not in self.timeline[-1]:
-            stops = [row["turn"] for row in self.timeline if self.plays(row["agent"])] or [0]
-            earlier = [stop for stop in stops if stop <= turn]
-            turn = max(earlier, default=stops[0])
-        self._go_to(turn)
+        stops = self.turns_of("")
+        stops += [len(self.timeline)] if "action" in self.timeline[-1] else []
+        earlier = [stop for stop in stops if stop <= turn]
+        self._go_to(max(earlier, default=min(stops, default=0)))
         if self.turn != before:
             self._record({"turn": self.turn})
 
@@ -347,17 +347,16 @@ class Game:
 
     def _return_to(self, turn: int) -> None:
         """Continue at a checkpoint. The beginning needs none."""
-        checkpoint = self.checkpoints.get(turn)
         previous = self.env
-        if checkpoint is None:
-            self.env = self.root
-            self.returns: dict[str, float] = {}
-        else:
-            self.env = clone(checkpoint.env)
-            self.returns = {**checkpoint.returns}
         self.over = ""
         self.latest = {row["agent"]: row["turn"] for row in self.timeline[:turn]}
-        if checkpoint is None:
+        if turn in self.checkpoints:
+            checkpoint = self.checkpoints[turn]
+            self.env = clone(checkpoint.env)
+            self.returns = {**checkpoint.returns}
+        else:
+            self.env = self.root
+            self.returns = {}
             self._attempt(self.root.reset, self.seed)
         if previous is not self.root:
             previous.close()
@@ -369,8 +368,7 @@ class Game:
         """Note the reward of the agent that decides next, and the agents that have ended."""
         self.turn = turn
         self.moment += 1
-        self.now = None
-        end = ""
+        end = "terminated"
         while self.env.agents and not self.over:
             agent = self.env.agent_selection
             _, reward, terminated, truncated, info = self.env.last(observe=False)
@@ -400,43 +398,22 @@ class Game:
 
     def _note_pending(self, agent: str) -> None:
         """Note the pending decision in the timeline, which may have it with its action."""
-        pending = self._attempt(at_decision, self.env, "play", pending_decision)
-        if pending is None:
+        row: Row | None = self._attempt(at_decision, self.env, "play", pending_decision)
+        if row is None:
             return
-        row: Row = {
-            "turn": self.turn,
-            "agent": agent,
-            "number": pending["number"],
-            "before": self.returns[agent],
-            "seen": pending["seen"],
-            "time": pending["time"],
-            "situation": pending["situation"],
-            "form": pending["form"],
-        }
-        if self.turn < len(self.timeline):
-            former = self.timeline[self.turn]
-            if any(row[key] != former[key] for key in REPEATED):
-                del self.timeline[self.turn :]
-                self.notice = (
-                    "The simulation does not repeat itself: its randomness does not all come from"
-                    " the seed."
-                )
+        row |= {"turn": self.turn, "before": self.returns[agent]}
+        former = self.timeline[self.turn] if self.turn < len(self.timeline) else row
+        if any(row[key] != former[key] for key in REPEATED):
+            del self.timeline[self.turn :]
+            self.notice = (
+                "The simulation does not repeat itself: its randomness does not all come from the"
+                " seed."
+            )
         if self.turn == len(self.timeline):
             self.timeline.append(row)
-        self.now = pending
         self.latest[agent] = self.turn
         if agent not in self.agents:
-            deciding = self.env.episode.agents[agent]
-            self._meet(agent, deciding.point.hook.name)
+            self._meet(agent, self.env.episode.agents[agent].point)
 
-    def _meet(self, agent: str, point: str) -> None:
-        self.agents[agent] = self.deciders.name_for(agent, point)
-
-    def _record(self, line: Message) -> None:
-        if self.recorder is not None:
-            self.notice = self.recorder.add(line) or self.notice
-
-
-def line_of(row: Row) -> Message:
-    """Return the line of a decision in a recording."""
-    return {key: value for key, value in row.items() if key in RECORDED}
+    def _meet(self, agent: str, point: Point | None) -> None:
+        self.agents[agent] = self.deciders.name_for(agent, "" if point is None else point.hook.name)

@@ -12,12 +12,14 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from secrets import randbelow
 from threading import Lock
 from time import monotonic
 from typing import Any, Final
 
+from ...core import Decision
 from ...errors import (
     InvalidActionError,
     OptionValueError,
@@ -26,7 +28,7 @@ from ...errors import (
     short_repr,
 )
 from ...simulation import check_seconds
-from ..descriptions import at_decision
+from ..descriptions import JSON, at_decision
 from .forms import Message, action_of, complaint_about, jsonable, picture_of, shown
 from .futures import Comparison, Exploration, Futures, Horizon
 from .game import Game, Row
@@ -55,6 +57,9 @@ TOOLS: Final = ("delegate", "skip", "undo", "redo", "jump", "restart", "horizon"
 
 WITH_MOMENT: Final = ("undo", "redo", "jump", "restart", "again")
 """The messages that count only at the moment that their page has shown."""
+
+SEEDS: Final = 2**31
+"""The number of seeds."""
 
 ROW_KEYS: Final = ("turn", "agent", "time", "action", "by", "words", "reward")
 """The keys of a past decision on the page."""
@@ -112,7 +117,7 @@ class Host:
         self,
         game: Game,
         rules: Rules,
-        send: Callable[[tuple[int | None, Message | None]], None],
+        send: Callable[[tuple[int | None, JSON]], None],
     ) -> None:
         """Take over a game.
 
@@ -132,18 +137,23 @@ class Host:
         self._lock = Lock()
         self._horizon = Horizon()
         self._picture: Message | None = None
-        self._moment = -1
-        self._stop_rule()
+        self._stop()
 
-    def _stop_rule(self) -> None:
+    def _stop(self) -> None:
+        """Stop the exploration and the rule, before a person changes the game."""
+        self.abandon()
         self.delegated: Counter[str] = Counter()
         self.skipping: str | None = None
 
+    def abandon(self) -> None:
+        """End the exploration, before the game changes."""
+        if self.exploring is not None:
+            self.exploring.abandon()
+
     def _tell(self, message: Message | None, number: int | None = None) -> None:
         """Send a message, also from the thread of an exploration."""
-        safe: Any = None if message is None else jsonable(message)
         with self._lock:
-            self._send((number, safe))
+            self._send((number, jsonable(message)))
 
     # -- messages ----------------------------------------------------------------------------------
 
@@ -172,8 +182,7 @@ class Host:
         """
         if self.game.now is not None and self._seconds_left() == 0.0:
             self._tell({"type": "busy", "on": True})
-            self.abandon()
-            self.game.decide(None, "limit")
+            self._decide(None, "limit")
             return True
         if not connection.poll(timeout):
             return False
@@ -186,23 +195,8 @@ class Host:
         except Exception as error:
             changed = not isinstance(error, ValueError)
             reply = {"type": "error", "text": message_of(error)}
-            reply |= self._complaint(seat, message, error)
         self._tell(reply, number)
         return changed
-
-    def _complaint(
-        self,
-        seat: str | None,
-        message: Message,
-        error: Exception,
-    ) -> Message:
-        """Say in words what is wrong with an illegal action, at its field."""
-        now = self.game.now
-        if now is None or now["agent"] != seat or message.get("turn") != self.game.turn:
-            return {}
-        if message.get("action") is None or not isinstance(error, InvalidActionError):
-            return {}
-        return complaint_about(now["form"], message["action"])
 
     def handle(self, seat: str | None, message: Message) -> bool:
         """Handle a message from a seat, the facilitator or the server.
@@ -221,8 +215,7 @@ class Host:
                 self._tell(self.snapshot())
             return self.skipping is not None
         do = message.get("do")
-        if do in ("act", "rule", "try"):
-            self._check_turn(message.get("turn"), seat)
+        person = seat or "The facilitator"
         if do in TOOLS and not self.rules.allow(seat):
             raise InvalidActionError("this seat has no tools: ask the facilitator")
         if do in WITH_MOMENT and message.get("moment", game.moment) != game.moment:
@@ -230,140 +223,104 @@ class Host:
             return False
         match message:
             case {"do": "rule"}:
+                self._check_turn(seat, message)
                 self._decide(None, "rule")
-            case {"do": "act", "action": action} if action is not None:
-                self._decide(action, "person")
-            case {"do": "try", "action": action} if action is not None:
-                self._try(action)
+            case {"do": "act" | "try", "action": action} if action is not None:
+                form = self._check_turn(seat, message)["form"]
+                self._check_action(action, form)
+                if do == "act":
+                    self._decide(action, "person")
+                elif isinstance(self.exploring, Futures):
+                    self.abandon()
+                    self.exploring.add(action)
             case {"do": "delegate", "n": int(number)} if 0 <= number <= 100_000:
-                self.delegated[seat or self._pending_seat()] = number
+                self.delegated[seat or ("" if game.now is None else game.now["agent"])] = number
                 self.skipping = None
             case {"do": "skip"}:
                 self.skipping = seat
             case {"do": "undo"}:
-                earlier = self._turns(seat, range(game.turn))
-                self._jump(max(earlier, default=0), seat)
+                earlier = [turn for turn in game.turns_of(seat) if turn < game.turn]
+                self._jump(person, max(earlier, default=0))
+            case {"do": "redo"} if game.can_go_back:
+                self._stop()
+                game.go_back()
+                self.event = f"{person} went back to the game before the restart."
             case {"do": "redo"}:
-                self._redo(seat)
-            case {"do": "jump", "n": int(number)} if 0 <= number <= len(game.timeline):
-                self._jump(number, seat)
-            case {"do": "restart" | "again"}:
-                self._restart(seat, message)
+                later = [turn for turn in game.turns_of(seat) if turn > game.turn]
+                self._jump(person, min(later, default=len(game.timeline)))
+            case {"do": "jump", "n": int(turn)} if 0 <= turn <= len(game.timeline):
+                self._jump(person, turn)
+            case {"do": "restart", "n": int(seed)} if 0 <= seed < SEEDS:
+                self._restart(person, seed)
+            case {"do": "restart", "n": None}:
+                self._restart(person, randbelow(SEEDS))
+            case {"do": "again"} if game.over and (not seat or self.rules.tools != "facilitator"):
+                self._restart(person, randbelow(SEEDS))
             case {"do": "horizon", "n": int() | float() as length} if 0 < length <= 1e9:
                 by_time = message.get("by") == "time"
-                if not by_time and length > 100:
-                    raise OptionValueError("Enter a whole number of decisions from 1 to 100.")
                 self.abandon()
-                self._horizon.set(by_time, length)
-                self._moment = -1
+                self._horizon = Horizon(by_time, length if by_time else min(int(length), 100))
+                self.exploring = None
             case _:
                 raise OptionValueError(f"the game cannot follow {short_repr(message)}")
         return True
 
+    def _check_turn(self, seat: str, message: Message) -> Row:
+        """Return the pending decision, if it is the one of a seat that its message means."""
+        now = self.game.now
+        if now is None or message.get("turn") != now["turn"]:
+            raise InvalidActionError("another decision is pending by now")
+        if now["agent"] != seat:
+            raise InvalidActionError(f"it is not your turn: {now['agent']} decides")
+        return now
+
+    def _check_action(self, action: Any, form: Message) -> None:
+        """Check an action as JSON, so that an illegal one does not end the exploration.
+
+        Raises:
+            InvalidActionError: It is not legal, with a text for people.
+        """
+        try:
+            at_decision(self.game.env, "play", partial(check_legal, action))
+        except InvalidActionError as error:
+            complaint = complaint_about(form, action).get("text")
+            raise InvalidActionError(complaint or str(error)) from error
+
     def _decide(self, action: Any, by: str) -> None:
-        if action is not None:
-            at_decision(self.game.env, "play", Legal(action))
         self.abandon()
         self.game.decide(action, by)
         self.event = ""
 
-    def _try(self, action: Any) -> None:
-        """Add a candidate to the futures.
-
-        Raises:
-            InvalidActionError: The action is not legal.
-        """
-        futures = self.exploring
-        if isinstance(futures, Futures):
-            at_decision(self.game.env, "play", Legal(action))
-            self.abandon()
-            self.exploring = futures.resumed(futures.env)
-            self.exploring.add(action)
-
-    def _redo(self, seat: str) -> None:
-        game = self.game
-        end = len(game.timeline)
-        if game.previous is not None and not any("action" in row for row in game.timeline):
-            self.abandon()
-            game.go_back()
-            self._stop_rule()
-            self.event = f"{_called(seat)} went back to the game before the restart."
-            return
-        later = self._turns(seat, range(game.turn + 1, end))
-        self._jump(min(later, default=end), seat)
-
-    def _jump(self, turn: int, seat: str) -> None:
+    def _jump(self, person: str, turn: int) -> None:
         game = self.game
         before = game.turn
-        self.abandon()
+        self._stop()
         game.jump(turn)
-        self._stop_rule()
         if game.turn != before:
             way = "went back" if game.turn < before else "went on"
-            self.event = f"{_called(seat)} {way} to {self._place()}."
+            place = "the end"
+            if game.now is not None:
+                when = self._when(game.now)
+                place = f"decision {game.turn + 1}" + (f", {when}" if when else "")
+            self.event = f"{person} {way} to {place}."
 
-    def _place(self) -> str:
-        """Return where the game stands, in words."""
-        game = self.game
-        if game.now is None:
-            return "the end"
-        when = self._when(game.now["time"])
-        return f"decision {game.turn + 1}" + (f", {when}" if when else "")
-
-    def _when(self, time: object) -> str:
-        unit = self.rules.time_unit or "time"
-        return "" if time is None else f"{unit} {shown(time)}"
-
-    def _restart(self, seat: str, message: Message) -> None:
-        """Begin another game, with a seed of the message or a random one.
-
-        Raises:
-            OptionValueError: The seed is none, or the game is not over.
-        """
-        seed = message.get("n")
-        if message["do"] == "again":
-            seed = None
-            if not self.game.over or (self.rules.tools == "facilitator" and seat):
-                raise OptionValueError("only the facilitator begins another game")
-        if seed in (None, ""):
-            seed = randbelow(2**31)
-        if type(seed) is not int or not 0 <= seed < 2**31:
-            raise OptionValueError(
-                f"Enter a whole number from 0 to {2**31 - 1}, or none for a random one."
-            )
-        self.abandon()
+    def _restart(self, person: str, seed: int) -> None:
+        self._stop()
         self.game.restart(seed)
-        self._stop_rule()
-        self.event = f"{_called(seat)} began another game, with seed {seed}."
+        self.event = f"{person} began another game, with seed {seed}."
 
-    def _turns(self, seat: str, turns: range) -> list[int]:
-        """Return the turns of a seat; for the facilitator, those of all people."""
-        agents = [self.game.timeline[turn]["agent"] for turn in turns]
-        return [
-            turn
-            for turn, agent in zip(turns, agents, strict=True)
-            if (agent == seat if seat else self.game.plays(agent))
-        ]
-
-    def _pending_seat(self) -> str:
-        return "" if self.game.now is None else str(self.game.now["agent"])
-
-    def _check_turn(self, turn: object, seat: str) -> None:
-        now = self.game.now
-        if now is None or turn != self.game.turn:
-            raise InvalidActionError("another decision is pending by now")
-        if now["agent"] != seat:
-            raise InvalidActionError(f"it is not your turn: {now['agent']} decides")
+    def _when(self, row: Row) -> str:
+        unit = self.rules.time_unit or "time"
+        return "" if row["time"] is None else f"{unit} {shown(row['time'])}"
 
     def _start_clock(self) -> bool:
         """Begin the time limit of the pending decision, once a person is there."""
-        game = self.game
-        if game.now is None or not self.occupied or self.rules.limit is None:
+        limit = self.rules.limit
+        moment = self.game.moment
+        if limit is None or not self.occupied or self.game.now is None or self._timed == moment:
             return False
-        if self._timed == game.moment:
-            return False
-        self._timed = game.moment
-        self.deadline = monotonic() + self.rules.limit
+        self._timed = moment
+        self.deadline = monotonic() + limit
         return True
 
     def _seconds_left(self) -> float | None:
@@ -388,15 +345,12 @@ class Host:
             if monotonic() > latest + PAUSE:
                 latest = monotonic()
                 yield self.snapshot()
-        if game.moment != self._moment:
+        if self.exploring is None or self.exploring.moment != game.moment:
             self.abandon()
-            self._moment = game.moment
-            self._picture = None
             if game.now is not None:
                 game.make_checkpoint()
                 self._start_clock()
-            if game.over in ENDS:
-                self._picture = picture_of(game.env)
+            self._picture = picture_of(game.env) if game.over in ENDS else None
             self.exploring = self._explore()
         yield self.snapshot()
         if self.exploring is None:
@@ -409,26 +363,17 @@ class Host:
     def _explore(self) -> Exploration | None:
         """Return the exploration of this moment: of futures, or at the end of the rule's game."""
         game = self.game
-        checkpoint = game.checkpoints.get(game.turn)
-        env = game.env if checkpoint is None else checkpoint.env
         if game.now is not None:
-            pending = game.now | {"turn": game.turn, "moment": game.moment}
-            return Futures(env, game.deciders, pending, self._horizon, game.seed)
+            here = game.checkpoints.get(game.turn)
+            return Futures(game.env if here is None else here.env, game, game.now, self._horizon)
         if game.over not in ENDS:
             return None
-        returns: dict[str, float] = {}
         if game.checkpoints:
             first = game.checkpoints[min(game.checkpoints)]
-            env, returns = first
-        else:
-            env = game.make_env()
-            env.reset(seed=game.seed)
-        return Comparison(env, game.deciders, returns, game.moment)
-
-    def abandon(self) -> None:
-        """End the exploration, before the game changes."""
-        if self.exploring is not None:
-            self.exploring.abandon()
+            return Comparison(first.env, game, first.returns)
+        env = game.make_env()
+        env.reset(seed=game.seed)
+        return Comparison(env, game, {})
 
     def _leaves_to_rule(self, agent: str) -> bool:
         if not self.game.plays(agent):
@@ -445,16 +390,14 @@ class Host:
     def snapshot(self) -> Message:
         """Return the message with all that the pages show, without its futures."""
         game = self.game
-        rows = game.timeline[: game.turn + 1]
-        decided = [row for row in rows if "action" in row and row["turn"] < game.turn]
+        past = game.timeline[: game.turn]
         seats = [agent for agent in game.agents if game.plays(agent)]
-        by_limit = [row["agent"] for row in game.timeline if row.get("by") == "limit"]
+        late = Counter(row["agent"] for row in game.timeline if row.get("by") == "limit")
         return {
             "type": "state",
             "title": self.rules.title,
             "time_unit": self.rules.time_unit,
             "tools": self.rules.tools,
-            "simulation": game.name,
             "seed": game.seed,
             "resumed": game.resumed,
             "seats": seats,
@@ -466,38 +409,39 @@ class Host:
             "over": game.over,
             "ending": ENDS.get(game.over, f"The game cannot go on: {game.over}"),
             "returns": {**game.returns},
-            "history": [self._past(row) for row in decided[-MOST_ROWS:]],
-            "views": self._views(rows),
+            "history": [self._past(row) for row in past[-MOST_ROWS:]],
+            "views": self._views(),
             "courses": self._courses(seats) if game.over else {},
             "left": self._seconds_left(),
-            "limit": self.rules.limit,
-            "late": Counter(by_limit),
+            "late": late,
             "picture": self._picture,
             "notice": game.notice,
             "event": self.event,
-            "back": game.previous is not None and not decided,
+            "back": game.can_go_back,
         }
 
     def _pending(self) -> Message | None:
         now = self.game.now
         if now is None:
             return None
-        own = [row for row in self.game.timeline[: self.game.turn] if row["agent"] == now["agent"]]
-        last = [row["action"] for row in own if row["by"] == "person"]
-        return now | {"when": self._when(now["time"]), "last": last[-1] if last else None}
+        last = None
+        for row in self.game.timeline[: self.game.turn]:
+            if row["agent"] == now["agent"] and row["by"] == "person":
+                last = row["action"]
+        return now | {"when": self._when(now), "last": last}
 
     def _past(self, row: Row) -> Message:
-        shown_row = {key: value for key, value in row.items() if key in ROW_KEYS}
-        return shown_row | {"when": self._when(row["time"])}
+        return {key: row[key] for key in ROW_KEYS} | {"when": self._when(row)}
 
-    def _views(self, rows: list[Row]) -> Message:
+    def _views(self) -> Message:
         """Return the latest situation of each agent, with the past values of its numbers."""
+        rows = self.game.timeline[: self.game.turn + 1]
         views: Message = {}
         for row in reversed(rows[-MOST_VALUES * 16 :]):
             agent = row["agent"]
             if agent not in views and len(views) < MOST_SEATS:
                 entries = [entry | {"past": []} for entry in row["situation"]]
-                views[agent] = {"when": self._when(row["time"]), "situation": entries}
+                views[agent] = {"when": self._when(row), "situation": entries}
             numbers = {entry["label"]: entry["number"] for entry in row["situation"]}
             for entry in views.get(agent, {"situation": ()})["situation"]:
                 number = numbers.get(entry["label"])
@@ -509,25 +453,14 @@ class Host:
         """Return the totals of seats after each of their decisions."""
         courses: Message = {}
         for agent in seats[:MOST_SEATS]:
-            rows = [row for row in self.game.timeline if row["agent"] == agent]
-            totals = [row["before"] for row in rows]
+            totals = [row["before"] for row in self.game.timeline if row["agent"] == agent]
             courses[agent] = [*totals, self.game.returns.get(agent, 0.0)]
         return courses
 
 
-class Legal:
-    """Refuses an action of a decision, given as JSON, that is not legal."""
-
-    def __init__(self, action: Any) -> None:
-        self.action = action
-
-    def __call__(self, decision: Any) -> None:
-        """Raise an ``InvalidActionError`` if the action is not legal."""
-        decision.validate(action_of(decision.action_space, self.action))
-
-
-def _called(seat: str) -> str:
-    return seat or "The facilitator"
+def check_legal(action: Any, decision: Decision) -> None:
+    """Raise an ``InvalidActionError`` if an action of a decision, as JSON, is not legal."""
+    decision.validate(action_of(decision.action_space, action))
 
 
 def message_of(error: Exception) -> str:

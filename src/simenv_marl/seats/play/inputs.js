@@ -16,6 +16,16 @@ function keysFor(texts) {
   return keys;
 }
 
+const isNumber = ({ type }) => type === "integer" || type === "number";
+
+// Put a value at a path into the JSON of an action: texts are keys, numbers are places in a list.
+function put(whole, [key, ...path], value) {
+  if (key === undefined) return value;
+  whole ??= typeof key === "number" ? [] : {};
+  whole[key] = put(whole[key], path, value);
+  return whole;
+}
+
 export const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);
 
 export class Answers {
@@ -81,7 +91,7 @@ export class Answers {
   field(field, i) {
     const wrong = make("p", { className: "wrong", id: `wrong${i}`, hidden: true });
     wrong.setAttribute("role", "alert");
-    const made = field.options ? this.choice(field, i) : "hint" in field ? this.number(field) : this.text(field);
+    const made = field.options ? this.choice(field, i) : isNumber(field) ? this.number(field) : this.text(field);
     const element = make("div", { className: "field" }, made.element, wrong);
     element.oninput = () => {
       this.chosen = undefined;
@@ -92,13 +102,13 @@ export class Answers {
     return { ...made, element, wrong, field };
   }
 
-  number({ name, low, high, whole }) {
-    const limits = { ...(low === null ? {} : { min: low }), ...(high === null ? {} : { max: high }) };
-    const step = whole ? 1 : "any", disabled = !this.active;
+  number({ name, type, minimum: low, maximum: high }) {
+    const limits = { ...(low === undefined ? {} : { min: low }), ...(high === undefined ? {} : { max: high }) };
+    const step = type === "integer" ? 1 : "any", disabled = !this.active;
     const input = make("input", { type: "number", step, disabled, ...limits });
     const parts = [make("label", {}, name ? make("span", {}, name) : "Answer", " ", input)];
     let slider = null;
-    if (low !== null && high !== null && high - low < 1e12) {
+    if (high - low < 1e12) {
       slider = make("input", { type: "range", step, disabled, ...limits, ariaLabel: `${name || "Answer"}, slider` });
       slider.oninput = () => { input.value = +Number(slider.value).toPrecision(4); };
       input.addEventListener("input", () => { slider.value = input.value; });
@@ -125,8 +135,8 @@ export class Answers {
     return { element, get, set, input: radios[0] };
   }
 
-  text({ name, longest, json }) {
-    const input = make("textarea", { rows: 3, disabled: !this.active, ...(longest ? { maxLength: longest } : {}) });
+  text({ name, maxLength, json }) {
+    const input = make("textarea", { rows: 3, disabled: !this.active, ...(maxLength ? { maxLength } : {}) });
     const label = json ? `${name || "The answer"}, as JSON: ${json}` : name || "Your text";
     const get = () => (json ? (input.value.trim() ? JSON.parse(input.value) : "") : input.value);
     const set = (value) => { input.value = json ? JSON.stringify(value) : value; };
@@ -135,12 +145,10 @@ export class Answers {
 
   // Fill in the fields from the JSON of an action.
   fill(action) {
-    const walk = (answer, value) => {
-      if (typeof answer === "number") this.fields[answer]?.set(value);
-      else if (answer && value && typeof value === "object")
-        for (const key of Object.keys(answer)) if (key in value) walk(answer[key], value[key]);
-    };
-    walk(this.form.answer, action);
+    for (const { field, set } of this.fields) {
+      const value = field.path.reduce((part, key) => part?.[key], action);
+      if (value !== undefined) set(value);
+    }
   }
 
   get isEmpty() {
@@ -152,23 +160,19 @@ export class Answers {
     if (this.chosen !== undefined)
       return this.chosen === null ? { do: "rule" } : { do: "act", action: this.chosen };
     if (this.form.cards) return undefined;
-    let fine = true;
-    const values = this.fields.map(({ get, field }, i) => {
+    let fine = true, action;
+    this.fields.forEach(({ get, field }, i) => {
       let value = "", problem = "";
       try { value = get(); } catch { problem = "This is not JSON."; }
       if (field.options && value === "") problem = "Choose one of these.";
-      if ("hint" in field && (typeof value !== "number" || value < (field.low ?? -Infinity)
-        || value > (field.high ?? Infinity) || (field.whole && !Number.isInteger(value))))
-        problem = `Enter ${field.hint}.`;
+      if (isNumber(field) && (typeof value !== "number" || value < field.minimum || value > field.maximum
+        || (field.type === "integer" && !Number.isInteger(value)))) problem = `Enter ${field.hint}.`;
       if (field.json && value === "" && !problem) problem = "Enter the answer.";
       this.complain(i, problem);
       fine &&= !problem;
-      return value;
+      action = put(action, field.path, value);
     });
-    const build = (answer) => (typeof answer === "number" ? values[answer]
-      : Array.isArray(answer) ? answer.map(build)
-      : Object.fromEntries(Object.entries(answer).map(([key, part]) => [key, build(part)])));
-    return fine ? { do: "act", action: build(this.form.answer) } : undefined;
+    return fine ? { do: "act", action } : undefined;
   }
 
   complain(i, text) {

@@ -18,10 +18,7 @@ function complain(text) {
 // -- messages ------------------------------------------------------------------------------------------
 
 connect((kind, message) => {
-  if (kind === "error" && !message.stranger) {
-    if (message.field !== undefined && current()?.fields[message.field]) current().complain(message.field, message.text);
-    else complain(message.text);
-  }
+  if (kind === "error" && !message.stranger) complain(message.text);
   redraw();
 });
 

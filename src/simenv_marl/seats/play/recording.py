@@ -15,9 +15,8 @@ from ...errors import (
     short_repr,
 )
 from ...simulation import Action, Model, Observation
-from ..descriptions import JSON
 from ..recordings import Lines, digest_of
-from .forms import Message, action_of, jsonable
+from .forms import Message, action_of
 
 
 @dataclass
@@ -48,26 +47,18 @@ class Episode:
             self.turn += 1
 
 
-class Recorder:
-    """Appends lines to a recording, which is closed in between: clones need not copy it.
+def follow(episodes: list[Episode], line: Message) -> None:
+    """Add a line to the episodes that the lines before it describe.
 
-    Lines that could not be written are written with the next one.
+    Raises:
+        ValueError, LookupError: The line does not fit the lines before it.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Use the file of a path, which need not exist."""
-        self._file = Lines(path)
-        self._unsaved: list[JSON] = []
-
-    def add(self, line: Message) -> str:
-        """Append a line; return the problem, or ""."""
-        self._unsaved.append(jsonable(line))
-        try:
-            self._file.append(*self._unsaved)
-        except OSError as error:
-            return f"The recording {self._file.path} cannot be written: {error}"
-        self._unsaved = []
-        return ""
+    if "seed" in line:
+        episodes.append(Episode(line))
+    elif line.get("back"):
+        episodes.pop()  # the game before the restart goes on
+    else:
+        episodes[-1].add(line)
 
 
 def read(path: str | os.PathLike[str]) -> list[Episode]:
@@ -82,12 +73,7 @@ def read(path: str | os.PathLike[str]) -> list[Episode]:
     episodes: list[Episode] = []
     try:
         for _, line in Lines(path).read():
-            if "seed" in line:
-                episodes.append(Episode(line))
-            elif line.get("back"):
-                episodes.pop()  # the game before the restart goes on
-            else:
-                episodes[-1].add(line)
+            follow(episodes, line)
         if not episodes and Path(path).stat().st_size:
             raise ValueError("it has no episode")
     except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:

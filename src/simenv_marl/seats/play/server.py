@@ -8,7 +8,9 @@ import select
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from hashlib import blake2b
 from ipaddress import ip_address
 from itertools import count
 from math import isfinite
@@ -20,14 +22,14 @@ from urllib.parse import quote, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse
-from starlette.routing import BaseRoute, Route, WebSocketRoute
-from starlette.types import ASGIApp, Lifespan, Receive, Scope, Send
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import Lifespan
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ...core import pack_plainly
-from ...errors import OptionValueError, ProcessDiedError, SimEnvError, StoreError
+from ...errors import OptionValueError, ProcessDiedError, StoreError
 from .forms import Message
 from .game import Game
 from .host import Rules, run_game
@@ -82,6 +84,7 @@ class Link:
     def __init__(self, websocket: WebSocket) -> None:
         """Make the link of an accepted websocket."""
         self.websocket = websocket
+        self.turns = asyncio.Semaphore(MOST_WAITING)  # one for each message to the game
         self._outbox: dict[str, str] = {}
         self._ready = asyncio.Event()
 
@@ -102,41 +105,23 @@ class Link:
                     await self.websocket.send_text(text)
 
 
-class Keys:
-    """The keys in the links of a game, which are the same when a recording is resumed.
+def secret_of(record: Path) -> bytes:
+    """Return the secret of a recorded game, from a file beside the recording.
 
-    Attributes:
-        seats: The seat of each key; "" for the facilitator.
+    Raises:
+        StoreError: The file cannot be read or written.
     """
-
-    def __init__(self, path: Path | None) -> None:
-        """Use a file, which need not exist; None: there is none.
-
-        Raises:
-            StoreError: The file cannot be read.
-        """
-        self.seats: dict[str, str] = {}
-        self._path = path
-        if path is not None and path.exists():
-            try:
-                self.seats = dict(json.loads(path.read_text(encoding="utf-8")))
-            except (OSError, ValueError, TypeError) as error:
-                raise StoreError(f"the keys {path} cannot be read: {error!r}") from error
-
-    def link(self, seat: str) -> str:
-        """Return the path of a seat's page, with its key."""
-        keys = {seat: key for key, seat in self.seats.items()}
-        if seat not in keys:
-            keys[seat] = secrets.token_hex(16)
-            self.seats[keys[seat]] = seat
-            self._save()
-        name = f"seat/{quote(seat, safe='', errors='replace')}" if seat else "facilitator"
-        return f"/{name}?key={keys[seat]}"
-
-    def _save(self) -> None:
-        if self._path is not None:
-            self._path.touch(mode=0o600)
-            self._path.write_text(json.dumps(self.seats), encoding="utf-8")
+    path = record.with_name(f"{record.name}.keys")
+    try:
+        if not path.exists():
+            path.touch(mode=0o600)
+            path.write_text(secrets.token_hex(32))
+        secret = bytes.fromhex(path.read_text())
+        if len(secret) != 32:
+            raise ValueError("it has no secret of 32 bytes")
+    except (OSError, ValueError) as error:
+        raise StoreError(f"the keys {path} cannot be read: {error!r}") from error
+    return secret
 
 
 class Table:
@@ -147,7 +132,7 @@ class Table:
         connection: Connection,
         state: Message,
         announce: Callable[[str], None],
-        keys: Keys | None = None,
+        secret: bytes | None = None,
         *,
         is_open: bool = True,
     ) -> None:
@@ -157,7 +142,7 @@ class Table:
             connection: The connection to the game.
             state: The first state of the game.
             announce: A function that is called with the path of each seat.
-            keys: The keys of the seats.
+            secret: The secret of the seats' keys. None: a random one.
             is_open: Whether the lobby gives free seats to all who ask.
         """
         self.links: dict[int, Link] = {}
@@ -165,13 +150,12 @@ class Table:
         self._connection = connection
         self._announce = announce
         self._is_open = is_open
-        self._keys = keys or Keys(None)
-        self._announced: set[str] = set()
+        self._secret = secret or secrets.token_bytes(32)
+        self._owners: dict[str, str] = {}  # the seat of each key; "" for the facilitator
         self._opened: dict[str, None] = {}  # the seats whose pages were open at any time
         self._seats: dict[int, str] = {}  # of the links; spectators have none
-        self._waiting: Counter[int] = Counter()  # messages of each link that wait for the game
         self._numbers = count(1)
-        self._inbox: asyncio.Queue[bytes] = asyncio.Queue()
+        self._writer = ThreadPoolExecutor(1)  # because the game may not read
         self._show(state)
 
     async def serve(self, websocket: WebSocket) -> None:
@@ -181,9 +165,8 @@ class Table:
         number = next(self._numbers)
         if len(self.links) >= MOST_PAGES:
             spectators = (self.links[other] for other in self.links if other not in self._seats)
-            closed = next(spectators, link)
             with suppress(RuntimeError):
-                await closed.websocket.close(1013)  # try again later
+                await next(spectators, link).websocket.close(1013)  # try again later
         self.links[number] = link
         for kind, text in self.latest.items():
             link.send(kind, text)
@@ -191,57 +174,51 @@ class Table:
         writer = asyncio.create_task(link.write())
         try:
             while (message := await websocket.receive())["type"] == "websocket.receive":
-                problem = self._pass_on(number, message.get("text") or "")
+                problem = await self._pass_on(number, message.get("text") or "")
                 if problem:
-                    link.send("error", json.dumps({"type": "error"} | problem))
+                    _send({"type": "error", "text": problem}, link)
                 await asyncio.sleep(PAUSE)
         except RuntimeError:  # this server has closed the page
             pass
         finally:
             writer.cancel()
-            del self.links[number], self._waiting[number]
+            del self.links[number]
             self._seats.pop(number, None)
             self._tell_people()
 
-    def _pass_on(self, number: int, text: str) -> Message:
-        """Check a message, and pass it on to the game; return the problem."""
+    async def _pass_on(self, number: int, text: str) -> str:
+        """Check a message, and pass it on to the game; return the problem, or ""."""
+        link = self.links[number]
         try:
             match json.loads(text, parse_constant=str, parse_float=_finite):
-                case {"do": "claim", "seat": str(seat)}:
-                    return self._claim(number, seat)
+                case {"do": "claim", "seat": str(seat)} if seat and seat in self._owners.values():
+                    if not self._is_open or seat in self._seats.values():
+                        return f"{seat} needs the link of this seat: ask for it"
+                    _send({"type": "link", "path": self._path(seat)}, link)
+                    return ""
                 case {"key": str(key), **message}:
-                    owner = self._keys.seats.get(key)
+                    owner = self._owners.get(key)
                     parcel = pickle.dumps((number, owner, message))  # it may be too deep
                 case _:
-                    return {"text": INVALID}
+                    return INVALID
         except (ValueError, RecursionError):
-            return {"text": INVALID}
+            return INVALID
         if owner is None or message.get("seat", owner) != owner:
-            return {"text": STRANGER, "stranger": True}
-        if message.get("do") == "take":
+            _send({"type": "error", "text": STRANGER, "stranger": True}, link)
+        elif message.get("do") == "take":
             if owner:
                 self._seats[number] = owner
                 self._opened[owner] = None
-            self.links[number].send("you", json.dumps({"type": "you", "seat": owner}))
+            _send({"type": "you", "seat": owner}, link)
             self._tell_people()
-        elif self._waiting[number] >= MOST_WAITING:
-            return {"text": "the game is busy; try again"}
+        elif link.turns.locked():
+            return "the game is busy; try again"
         else:
-            self._waiting[number] += 1
-            self._inbox.put_nowait(parcel)
+            await link.turns.acquire()
+            self._write(parcel)
             if message.get("do") in MOVES:
                 self._send_all({"type": "busy", "on": True})
-        return {}
-
-    def _claim(self, number: int, seat: str) -> Message:
-        """Give a free seat to a page of the lobby; return the problem."""
-        if seat not in self._announced:
-            return {"text": INVALID}
-        if not self._is_open or seat in self._seats.values():
-            return {"text": f"{seat} needs the link of this seat: ask for it"}
-        link = {"type": "link", "path": self._keys.link(seat)}
-        self.links[number].send("link", json.dumps(link))
-        return {}
+        return ""
 
     def _tell_people(self) -> None:
         """Tell pages and game which seats people have."""
@@ -256,46 +233,55 @@ class Table:
                 "open": self._is_open,
             }
         )
-        self._inbox.put_nowait(pickle.dumps((None, None, {"taken": people})))
+        self._write(pickle.dumps((None, None, {"taken": people})))
+
+    def _write(self, parcel: bytes) -> None:
+        self._writer.submit(Connection.send_bytes, self._connection, parcel)
 
     def _show(self, message: Message) -> None:
         if message["type"] == "state":
             self.latest.pop("busy", None)
-            seats = ["", *message["seats"]] if message.get("tools") == "facilitator" else ()
-            for seat in seats or message.get("seats", ()):
-                if seat not in self._announced:
-                    self._announced.add(seat)
-                    self._announce(self._keys.link(seat))
+            facilitators = [""] if message.get("tools") == "facilitator" else []
+            for seat in [*facilitators, *message.get("seats", ())]:
+                if seat not in self._owners.values():
+                    self._owners[self._key(seat)] = seat
+                    self._announce(self._path(seat))
         self._send_all(message)
 
+    def _key(self, seat: str) -> str:
+        """Return the key of a seat, which is the same when a recording is resumed."""
+        name = seat.encode(errors="backslashreplace")
+        return blake2b(name, key=self._secret, digest_size=16).hexdigest()
+
+    def _path(self, seat: str) -> str:
+        """Return the path of a seat's page, with its key."""
+        name = f"seat/{quote(seat, safe='', errors='replace')}" if seat else "facilitator"
+        return f"/{name}?key={self._key(seat)}"
+
     def _send_all(self, message: Message) -> None:
-        kind = message["type"]
-        text = self.latest[kind] = json.dumps(message, allow_nan=False)
-        for link in self.links.values():
-            link.send(kind, text)
+        self.latest[message["type"]] = _send(message, *self.links.values())
 
     async def read_game(self) -> None:
         """Show the messages of the game, until it ends."""
         with suppress(EOFError, OSError):
             while True:
                 number, message = await asyncio.to_thread(self._connection.recv)
-                link = self.links.get(number)
-                if link is not None:
-                    self._waiting[number] -= 1
-                if message is not None:
-                    if number is None:
-                        self._show(message)
-                    else:
-                        self._send_all({"type": "busy", "on": False})
-                        if link is not None:
-                            link.send("error", json.dumps(message))
+                links = [self.links[number]] if number in self.links else []  # the page is gone
+                for link in links:
+                    link.turns.release()
+                if number is not None and message is not None:
+                    self._send_all({"type": "busy", "on": False})
+                    _send(message, *links)
+                elif message is not None:
+                    self._show(message)
 
-    async def write_game(self) -> None:
-        """Pass messages on to the game."""
-        with suppress(OSError):
-            while True:
-                parcel = await self._inbox.get()
-                await asyncio.to_thread(self._connection.send_bytes, parcel)
+
+def _send(message: Message, *links: Link) -> str:
+    """Send a message to pages; return its text."""
+    text = json.dumps(message, allow_nan=False)
+    for link in links:
+        link.send(message["type"], text)
+    return text
 
 
 def _finite(text: str) -> float | str:
@@ -310,53 +296,39 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
-def make_app(
-    table: Table,
-    host: str,
-    lifespan: Lifespan[Starlette],
-) -> ASGIApp:
+def make_app(table: Table, host: str, lifespan: Lifespan[Starlette]) -> Starlette:
     """Make the application. It answers only requests to its own names and from its own pages."""
-
-    async def page(request: Request) -> FileResponse:
-        path = request.url.path
-        if path not in FILES:  # the page itself
-            path = "/page.html"
-        return FileResponse(Path(__file__).with_name(path[1:]), headers=HEADERS)
-
-    routes: list[BaseRoute] = [Route(path, page) for path in (*PATHS, *FILES)]
-    routes.append(WebSocketRoute("/ws", table.serve))
-    app = Starlette(routes=routes, lifespan=lifespan)
     names = {"localhost", host.lower(), socket.gethostname().lower()}
 
-    async def guarded(
-        scope: Scope,
-        receive: Receive,
-        send: Send,
-    ) -> None:
-        headers = {name: value.decode("latin-1") for name, value in scope.get("headers", ())}
-        netloc = headers.get(b"host", "")
-        origin = headers.get(b"origin", "")
-        is_own_page = not origin or origin.partition("//")[2] == netloc
-        if scope["type"] == "lifespan" or (is_own_page and _is_own(netloc, names)):
-            await app(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
+    async def page(request: Request) -> Response:
+        if not _is_own(request, names):
+            return PlainTextResponse("This server has another name.", 403)
+        file = request.url.path[1:] if request.url.path in FILES else "page.html"
+        return FileResponse(Path(__file__).with_name(file), headers=HEADERS)
+
+    async def messages(websocket: WebSocket) -> None:
+        if _is_own(websocket, names):
+            await table.serve(websocket)
         else:
-            await PlainTextResponse("This server has another name.", 403)(scope, receive, send)
+            await websocket.close()
 
-    return guarded
+    pages = [Route(path, page) for path in (*PATHS, *FILES)]
+    return Starlette(routes=[*pages, WebSocketRoute("/ws", messages)], lifespan=lifespan)
 
 
-def _is_own(netloc: str, names: set[str]) -> bool:
-    """Return whether a Host header has a name of this server, or an address.
+def _is_own(connection: HTTPConnection, names: set[str]) -> bool:
+    """Return whether the Host header has a name of this server, or an address, as the Origin has.
 
     An address is safe, because only a name can be bound to another server.
     """
+    netloc = connection.headers.get("host", "")
+    origin = connection.headers.get("origin", "")
     try:
         name = (urlsplit(f"//{netloc}").hostname or "").lower()
-        return name in names or bool(ip_address(name))
+        is_own = name in names or bool(ip_address(name))
     except ValueError:
         return False
+    return is_own and (not origin or origin.partition("//")[2] == netloc)
 
 
 def serve(
@@ -381,13 +353,15 @@ def serve(
     """
     if not 0 <= port < 65_536:
         raise OptionValueError(f"there is no port {port}")
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise OptionValueError(f"cannot listen on {host}, port {port}: {error}") from error
     # A spawned process inherits neither threads nor sockets, which clones would copy.
     context = get_context("spawn")
     connection, game_connection = context.Pipe()
-    process = context.Process(
-        target=run_game,
-        args=(game_connection, pack_plainly(make)),
-    )
+    process = context.Process(target=run_game, args=(game_connection, pack_plainly(make)))
     process.start()
     game_connection.close()
 
@@ -403,48 +377,31 @@ def serve(
         _, state = connection.recv()
         if state["type"] == "failed":
             raise OptionValueError(state["text"])
-        keys = Keys(None if record is None else record.with_name(f"{record.name}.keys"))
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, port), family=family) as listener:
-            base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
-            if state["resumed"]:
-                print(f"The game of {record} goes on.", flush=True)
-            print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
-            table = Table(
-                connection,
-                state,
-                lambda path: print(f"  {base}{path}", flush=True),
-                keys,
-                is_open=_is_loopback(host),
-            )
-            _run(table, host, listener, end_game)
+        secret = None if record is None else secret_of(record)
+        address, bound, *_ = listener.getsockname()
+        shown_host = f"[{host}]" if ":" in host else host
+        if ip_address(address).is_unspecified:
+            shown_host = socket.gethostname()
+        base = f"http://{shown_host}:{bound}"
+        if state["resumed"]:
+            print(f"The game of {record} goes on.", flush=True)
+        print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
+
+        def announce(path: str) -> None:
+            print(f"  {base}{path}", flush=True)
+
+        table = Table(connection, state, announce, secret, is_open=ip_address(address).is_loopback)
+        _run(table, host, listener, end_game)
     except EOFError:
         process.join()
         raise ProcessDiedError(
             f"the process of the game has ended, with exit code {process.exitcode}"
         ) from None
-    except OSError as error:
-        if isinstance(error, SimEnvError):
-            raise
-        raise OptionValueError(f"cannot listen on {host}, port {port}: {error}") from error
     finally:
         end_game()
+        listener.close()
     returns = json.loads(table.latest["state"])["returns"]
     return "The returns: " + ", ".join(f"{agent} {total:g}" for agent, total in returns.items())
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
-
-
-def _shown_host(host: str) -> str:
-    """Return the host of the links for an address to listen on."""
-    if host in ("0.0.0.0", "::"):
-        return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
 
 
 def _run(
@@ -464,13 +421,11 @@ def _run(
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         nonlocal died
         reader = asyncio.create_task(table.read_game())
-        writer = asyncio.create_task(table.write_game())
         reader.add_done_callback(server.exit_soon)
         yield
         died = reader.done()
         await asyncio.to_thread(end_game)
         await reader
-        writer.cancel()
 
     config = uvicorn.Config(
         make_app(table, host, lifespan),

@@ -61,6 +61,7 @@ def play(
         SimEnvError: An argument is invalid, or the simulation cannot be played.
     """
     name = source_name(simulation)
+    path = None if record is None else Path(record)
     make = partial(
         make_game,
         simulation,
@@ -69,12 +70,12 @@ def play(
         name=name,
         seats=list(seats),
         seed=seed,
-        record=None if record is None else Path(record),
+        record=path,
         new=new,
         options=options,
         rules=Rules(title or name.rpartition(".")[2], tools, limit, time_unit),
     )
-    return start(make, host=host, port=port, record=None if record is None else Path(record))
+    return start(make, host=host, port=port, record=path)
 
 
 def make_game(

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from math import inf, isfinite, nan, sqrt
+from itertools import pairwise
+from math import inf, nan
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, Unpack
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium.spaces import Discrete
 
 from ..core import (
     Action,
-    Agent,
     Decision,
-    Episode,
-    EpisodeOptions,
-    Labels,
-    Model,
     Plan,
     Points,
     Policy,
@@ -35,42 +31,36 @@ from ..core import (
 from ..data.collect import learners_plan
 from ..data.plots import style
 from ..envs.base import View
-from ..errors import OptionValueError, close_after, short_repr, warn_user
-from ..hooks.stacks import outside_simulation
+from ..errors import OptionValueError, short_repr, warn_user
 from ..many.batch import policy_keys
-from ..many.parallel import import_extra, progress_bar
-from ..runs import checked_policies
-from ..simulation import EVERYONE, RULE, check_count, is_number
+from ..many.parallel import import_extra
+from ..simulation import EVERYONE, RULE, Model, check_count, is_number
 from .plots import LOOKS
-from .runner import Row, distinct_seeds, make_table
+from .runner import distinct_seeds, error_note, make_table
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure, SubFigure
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
 KEY: Final = 0x6C656467
 """Separates the seeds of futures and samples from others that follow from the episode's seed."""
 
-LONG: Final = 300.0
-"""The user is told beforehand if it will take more seconds than this."""
+LONG: Final = 5.0
+"""The user is told beforehand if it will take more minutes than this."""
 
-MARKED: Final = 10
-"""The number of decisions that a plot marks."""
+FIRST: Final = ("seed", "number", "agent", "time")
 
-UNSTABLE: Final = 0.1
-"""The share of decisions whose best action may change with the horizon without a warning."""
-
-WORTH: Final = ("value", "contribution", "skill", "luck", "error")
-
-COLUMNS: Final = ("seed", "number", "agent", "time", "decision", "action", "rule_action", *WORTH)
+WORTH: Final = ("contribution", "skill", "luck")
 
 Metric = Callable[[Model], float] | None
 """A callable of the simulation, whose result takes the place of rewards."""
 
+Row = dict[str, Any]
+"""A row of a table, by column."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """What the decisions of episodes were worth. Made by ``ledger``.
+    """The worth of the decisions of episodes. Made by ``ledger``.
 
     Attributes:
         frame: A ``DataFrame`` with a row for each decision. Columns: ``seed``; ``number``, the
@@ -87,12 +77,9 @@ class Ledger:
     """
 
     frame: DataFrame
-    points: tuple[str, ...]
-    returns: Series[float]
+    points: list[str]
+    returns: dict[int, float]
     after: str
-
-    def __repr__(self) -> str:
-        return f"<Ledger: {len(self.frame)} decisions on {len(self.returns)} seeds>"
 
     def summary(self) -> DataFrame:
         """Return the means over the seeds of the sums, by agent and decision point.
@@ -101,38 +88,32 @@ class Ledger:
             A table indexed by ``agent`` and ``point``, with the columns ``decisions`` (their mean
             number), ``contribution``, ``skill`` and ``luck``.
         """
-        names = list(WORTH[1:4])
-        table = self.frame[["agent", *names]].astype(dict.fromkeys(names, float))
-        table = table.assign(point=self.points, decisions=1.0)
-        groups = table.groupby(["agent", "point"])[["decisions", *names]]
-        return groups.sum(min_count=1) / len(self.returns)
+        table = self.frame.assign(point=self.points, decisions=1.0)
+        sums = table.groupby(["agent", "point"])[["decisions", *WORTH]].sum(min_count=1)
+        return sums / len(self.returns)
 
-    def plot(self, *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
+    def plot(self, *, figure: Any = None) -> Any:
         """Draw the cumulated contributions of each seed, and name the ten largest.
 
         With ``after="policy"`` they do not add up, and are drawn one by one. ``figure`` and the
         result are as in ``plot_timeline``.
         """
-        frame = self.frame
-        along = "number" if frame["time"].isna().any() else "time"
-        heights = frame["contribution"]
-        if self.after == "rule":
-            heights = heights.groupby(frame["seed"]).cumsum()
+        table = self.frame
+        along = "number" if table["time"].isna().any() else "time"
+        worth = table.groupby("seed")["contribution"]
+        heights = worth.cumsum() if self.after == "rule" else table["contribution"]
         with style(figure) as make_figure:
             figure = make_figure(9.0, 4.5)
             axes = figure.subplots()
-            for _, rows in frame.groupby("seed"):
-                axes.plot(rows[along], heights[rows.index], linewidth=1.2)
+            axes.set(xlabel=along, ylabel="contributions")
             axes.axhline(0.0, **LOOKS["zero"])
-            marked = frame["contribution"].abs().astype(float).nlargest(MARKED).index
-            for index, row in frame.loc[marked].iterrows():
-                place = row[along], heights[index]
-                text = f"{row['agent']}: {row['decision']} ({row['contribution']:+.3g})"
-                axes.plot(*place, "o", color=LOOKS["zero"]["color"])
-                axes.annotate(text, place, (6, 0), **LOOKS["number"])
-            axes.set_xlabel(along if along == "time" else "number of the decision")
-            added = "cumulated contributions" if self.after == "rule" else "contribution"
-            axes.set_ylabel(added)
+            for rows in worth.groups.values():
+                axes.plot(table[along][rows], heights[rows])
+            for row in table["contribution"].abs().nlargest(10).index:
+                text = "\N{BULLET} {agent}: {decision} ({contribution:+.3g})".format(
+                    **table.loc[row]
+                )
+                axes.annotate(text, (table[along][row], heights[row]), (-2, 0), **LOOKS["number"])
         return figure
 
 
@@ -148,16 +129,15 @@ def ledger(
     metric: Metric = None,
     sample: float | None = None,
     method: str | None = None,
-    progress: bool = False,
-    **options: Unpack[EpisodeOptions],
+    **options: Any,
 ) -> Ledger:
-    """Measure what each decision of the policies was worth.
+    """Measure the worth of each decision of the policies.
 
-    Episodes run by the policies. Before each decision that they answer, an exact copy of the
-    episode goes on to its end by the baseline; its return is the value of the decision. The
-    contribution of a decision is the value of the next one (after the last one, the return of the
-    episode) less its own. So the contributions of a seed add up to the difference between the
-    returns of the policies and of the baseline on that seed.
+    Episodes run by the policies. At each decision that they answer, an exact copy of the episode
+    goes on to its end by the baseline; its return is the value of the decision. The contribution of
+    a decision is the value of the next one (after the last one, the return of the episode) less its
+    own. So the contributions of a seed add up to the difference between the returns of the policies
+    and of the baseline on that seed.
 
     The return is the sum of the rewards of all agents that the policies answer, or the total of
     ``team_reward=``, or the metric.
@@ -166,8 +146,9 @@ def ledger(
     times, alike for the chosen action and for the baseline's. ``skill`` is the mean return of the
     chosen action, after which the baseline decides, less that of the baseline; ``luck`` is the next
     value less the mean of the chosen action. The first value, all skill and all luck of a seed add
-    up to its return. Without futures, both are nan. Where nothing is random (``deterministic = True``
-    of the simulation), skill is the contribution.
+    up to its return; contributions are those of the exact copies all the same. Without futures,
+    skill and luck are nan. If nothing is random (``deterministic = True`` of the simulation), there
+    is one future, and skill is the contribution.
 
     Each decision takes one branch to the end of the episode, and two more for each future.
 
@@ -176,20 +157,19 @@ def ledger(
         policies: The policies, as ``simulate`` takes them.
         seeds: The seeds of the episodes, all different.
         points: As ``simulate`` takes them.
-        baseline: ``RULE``, a policy, or policies by agent or point, which answer in place of the
-            policies. Agents that they do not name follow their rule.
+        baseline: ``RULE``, a policy, or a dict of these by agent or dotted name of a point, which
+            answer in place of the policies. Agents that it does not name follow their rule.
         after: "rule": in the copy, the baseline answers all further decisions. "policy": it answers
             this one, and then the policies go on. The contribution is then the return of the
-            episode less that of the copy: the cost of this decision, as everything else was done.
-            Such contributions do not add up. ``luck`` is then the return less the mean of the
-            chosen action.
+            episode less that of the copy: the worth of this decision among all the others. Such
+            contributions do not add up. ``luck`` is then the return less the mean of the chosen
+            action.
         futures: The number of futures for each decision.
         metric: A callable of the simulation at its end, in place of rewards. Larger is better.
         sample: The share of the decisions, drawn at random, that have rows. It is for screening:
             the sum over a sample does not estimate the sum over all.
         method: The method of branching, as ``branch`` takes it. "replay" is faster if a whole
             episode takes less than a few milliseconds.
-        progress: Whether to show a progress bar, by ``tqdm``.
         **options: The options of ``evaluate``.
 
     Returns:
@@ -199,27 +179,69 @@ def ledger(
         OptionValueError: An argument has an invalid value, or a policy that decides in copies waits
             or records, so that a fallback would answer there.
         BranchError: An episode cannot be copied, or with ``futures`` not be reseeded.
-        MissingExtraError: pandas or tqdm is missing.
+        MissingExtraError: pandas is missing.
         BaseException: Any exception of the model, a mapping, a policy or the metric.
     """
-    pandas = import_extra("pandas", "ledger")
-    if after not in ("rule", "policy"):
-        raise OptionValueError(f'after must be "rule" or "policy", not {short_repr(after)}')
-    check_count(futures, "futures")
-    if after == "policy":
-        _check_in_copies(policies, "policies")
-    accounts = _Accounts(simulation, policies, points, baseline, metric, sample, method, options)
-    all_seeds = distinct_seeds(seeds)
+    adds_up = after == "rule"
+    if not adds_up:
+        if after != "policy":
+            raise OptionValueError(f'after must be "rule" or "policy", not {short_repr(after)}')
+        _check_in_copies(policies)
+    plan = learners_plan(simulation, policies, points, options, alone=True)
+    copies = _Copies(plan, baseline, adds_up, futures, metric, sample, method)
     rows: list[Row] = []
+    own: list[Row] = []  # of the present episode; values are also needed after each drawn decision
     returns: dict[int, float] = {}
-    with progress_bar(len(all_seeds), progress, "episode") as bar:
-        for seed in all_seeds:
-            own, returns[seed] = accounts.book(seed, after, futures, 0 if rows else len(all_seeds))
-            rows += own
-            bar.update()
-    by_seed = pandas.Series(returns, name="return", dtype=float).rename_axis("seed")
-    places = tuple(str(row["point"]) for row in rows)
-    return Ledger(make_table(COLUMNS, rows), places, by_seed, after)
+    all_seeds = distinct_seeds(seeds)
+    with closing(copies.run(all_seeds)) as stands:
+        for stand, action, is_drawn in stands:
+            agent = stand.episode.pending
+            if agent is None:
+                returns[stand.episode.seed] = total = stand.earned
+                own.append({"exact": total, "value": total})
+                for row, following in pairwise(own):
+                    later = following if adds_up else own[-1]
+                    row["contribution"] = later["exact"] - row["exact"]
+                    row["luck"] = later["value"] - row["chosen"]
+                    if copies.futures is None:
+                        row |= {"skill": row["contribution"], "luck": 0.0}
+                rows += [row for row in own if row.get("is_drawn")]
+                own = []
+            elif is_drawn or (adds_up and own and own[-1]["is_drawn"]):
+                begun = perf_counter()
+                [exact], _, known, turns = copies.ahead(stand, None)
+                branches = turns * len(all_seeds) * copies.share * (1 + 2 * futures)
+                minutes = branches * (perf_counter() - begun) / 120
+                if not (own or returns) and minutes > LONG:
+                    warn_user(
+                        f"the ledger takes about {branches:.0f} branches and {minutes:.0f} minutes;"
+                        " pass fewer seeds or futures, a sample=, or, for quick episodes,"
+                        ' method="replay"'
+                    )
+                ruled, chosen = np.array([exact]), np.array([nan])
+                if copies.futures:
+                    ruled = copies.ahead(stand, None, copies.futures)[0]
+                    chosen = copies.ahead(stand, action, copies.futures)[0]
+                if action is RULE and baseline is RULE and known is not None:
+                    action = known
+                action = _plain(action)
+                labels = agent.point.action_labels(agent.choices, *agent.arguments.recall())
+                row = stand.heading | {
+                    "decision": _words(action, labels),
+                    "action": action,
+                    "rule_action": known,
+                    "value": ruled.mean(),
+                    "chosen": chosen.mean(),
+                    "skill": (chosen - ruled).mean(),
+                    "error": _error(chosen - ruled) if copies.futures else 0.0,
+                    "exact": exact,
+                    "point": agent.point.hook.name,
+                    "is_drawn": is_drawn,
+                }
+                own.append(row)
+    columns = ["decision", "action", "rule_action", "value", *WORTH, "error"]
+    frame = make_table([*FIRST, *columns], rows)
+    return Ledger(frame, [row["point"] for row in rows], returns, after)
 
 
 def decision_values(
@@ -228,20 +250,18 @@ def decision_values(
     *,
     seeds: Iterable[int],
     points: Points = None,
-    baseline: Policy = RULE,
     horizon: int | None = None,
     futures: int = 16,
     metric: Metric = None,
     describe: Callable[[Decision], str] | None = None,
     sample: float | None = None,
     method: str | None = None,
-    progress: bool = False,
-    **options: Unpack[EpisodeOptions],
+    **options: Any,
 ) -> DataFrame:
     """Measure the value of each legal action at each decision of episodes.
 
     It is the mean return of the deciding agent over futures in which the action is taken, and the
-    baseline decides from then on.
+    rules of all agents decide from then on.
 
     Args:
         simulation: As ``simulate`` takes it.
@@ -249,9 +269,8 @@ def decision_values(
             other agents have no rows. None: all agents follow their rule, and have rows.
         seeds: The seeds of the episodes, all different.
         points: As ``simulate`` takes them.
-        baseline: As ``ledger`` takes it.
         horizon: The number of the agent's decisions whose rewards count, including the action. With
-            it, a warning tells if the best action is another one with twice the horizon, at more
+            it, a warning tells if the best action is not the best with twice the horizon, at more
             than a tenth of the decisions. None: up to the agent's end.
         futures: The number of futures, alike for all actions of a decision. 0, and a simulation
             that is ``deterministic``: the exact one.
@@ -261,7 +280,6 @@ def decision_values(
             ``simenv_marl.seats.describe``.
         sample: As ``ledger`` takes it.
         method: As ``ledger`` takes it.
-        progress: As ``ledger`` takes it.
         **options: The options of ``evaluate``.
 
     Returns:
@@ -274,379 +292,249 @@ def decision_values(
         OptionValueError: An argument has an invalid value, or an action space is not ``Discrete``.
         BaseException: Any other error of ``ledger``.
     """
-    import_extra("pandas", "decision_values")
-    check_count(futures, "futures")
     if horizon is not None:
         check_count(horizon, "horizon", 1)
-    played = checked_policies(policies) or {EVERYONE: RULE}
-    accounts = _Accounts(simulation, played, points, baseline, metric, sample, method, options)
-    all_seeds = distinct_seeds(seeds)
+    plan = learners_plan(simulation, policies or {EVERYONE: RULE}, points, options, alone=True)
+    copies = _Copies(plan, RULE, True, futures, metric, sample, method, horizon or inf)
     rows: list[Row] = []
     changes: list[bool] = []
-    with progress_bar(len(all_seeds), progress, "episode") as bar:
-        for seed in all_seeds:
-            for own, changed in accounts.compare(seed, horizon or inf, futures, describe):
-                rows += own
-                changes.append(changed)
-            bar.update()
-    if sum(changes) > UNSTABLE * len(changes):
+    with closing(copies.run(distinct_seeds(seeds))) as stands:
+        for stand, _, is_drawn in stands:
+            agent = stand.episode.pending
+            if agent is None or not is_drawn:
+                continue
+            decision = agent.describe(stand.episode.seed, Where.USER)
+            labels: Any = decision.action_labels
+            if not isinstance(decision.action_space, Discrete):
+                raise OptionValueError(
+                    f"the values of all actions need Discrete action spaces; {agent.name!r} has"
+                    f" {short_repr(decision.action_space)}. Name other agents in policies=, or"
+                    " other points"
+                )
+            heading = stand.heading
+            if describe:
+                heading["prompt"] = describe(decision)
+            *_, known, _ = copies.ahead(stand, RULE)
+            means = []
+            for action, label in labels.items():
+                if agent.allows(action):
+                    near, far, *_ = copies.ahead(stand, action, copies.futures)
+                    means.append((near.mean(), far.mean()))
+                    row = heading | {"action": action, "label": label, "value": near.mean()}
+                    row["error"] = _error(near) if copies.futures else 0.0
+                    row["by_rule"] = None if known is None else known == action
+                    rows.append(row)
+            changes.append(max(means)[1] < max(later for _, later in means))
+    if 10 * sum(changes) > len(changes):
         warn_user(
             f"the best action changes between the horizons {horizon} and {2 * (horizon or 0)} at"
             f" {sum(changes)} of {len(changes)} decisions: values at this horizon do not tell which"
             " action is best; pass a longer horizon, or more futures"
         )
-    columns = ["seed", "number", "agent", "time", "action", "label", "value", "error", "by_rule"]
-    return make_table([*columns, *(["prompt"] if describe else [])], rows)
-
-
-# -- who decides ----------------------------------------------------------------------------------
-
-
-class _Stand(View):
-    """The view of an episode that stands at a decision, for ``branch``."""
-
-    @property
-    def unwrapped(self) -> Self:
-        """The view itself."""
-        return self
-
-
-class _Side:
-    """The policies of a plan, which answer the decisions of an episode."""
-
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._by_point = {point.hook: point.policy for point in plan.points}
-
-    def answer(self, episode: Episode) -> Action:
-        """Answer the pending decision."""
-        agent = _pending(episode)
-        policy = self._policy_of(agent)
-        if policy is RULE:
-            return RULE
-        try:
-            with episode.context() if self._plan.options.global_rng else nullcontext():
-                seen = duplicate(agent.raw_observation)
-                answer = policy.answer(episode, agent, seen, agent.take_info())
-        except BaseException as error:
-            episode.annotate(error)
-            raise
-        action, _ = split_extras(answer, agent.point.definition.action_space)
-        return action
-
-    def pass_over(self, episode: Episode) -> None:
-        """Let a policy for all agents begin a round although another side answers now."""
-        if getattr(self._policy_of(_pending(episode)), "sees_all", False):
-            self.answer(episode)
-
-    def _policy_of(self, agent: Agent) -> Policy:
-        plan = self._plan
-        own = plan.policies.get(agent.name) or self._by_point.get(agent.point.hook)
-        return own or plan.everyone or RULE
-
-
-def _pending(episode: Episode) -> Agent:
-    agent = episode.pending
-    assert agent is not None
-    return agent
-
-
-def _check_in_copies(policies: object, name: str) -> None:
-    """Refuse policies that are not asked in copies."""
-    parts = policies.values() if isinstance(policies, Mapping) else [policies]
-    for policy in parts:
-        if policy is not RULE and policy_for(policy, "", Where.CLONE) is not policy:
-            raise OptionValueError(
-                f"{short_repr(policy)} in {name} waits or records its answers, and its fallback, or"
-                " the rule, answers in copies of the episode; pass a policy that answers at once"
-            )
+    columns = [*FIRST, "action", "label", "value", "error", "by_rule", "prompt"]
+    return make_table(columns if describe else columns[:-1], rows)
 
 
 # -- the engine -----------------------------------------------------------------------------------
 
 
-class _End(NamedTuple):
-    """The result of a copy.
+class _Stand(View):
+    """The view of an episode that stands at a decision, for ``branch``.
 
     Attributes:
-        value: The return at its end.
-        near: The return at the horizon.
-        action: The first action. That of the rule if it is known, else None.
-        turns: The number of decisions of the episode.
+        earned: The return of the episode so far.
     """
 
-    value: float
-    near: float
-    action: Action
-    turns: int
+    earned = 0.0
+
+    @property
+    def unwrapped(self) -> View:
+        """The view itself."""
+        return self
+
+    @property
+    def heading(self) -> Row:
+        """The first columns of the pending decision."""
+        episode: Any = self.episode
+        agent = episode.pending
+        row = episode.seed, episode.turns + 1, agent.name, agent.now
+        return dict(zip(FIRST, row, strict=True))
 
 
-class _Accounts:
-    """Runs episodes by policies, and copies of them by the baseline."""
+@dataclass
+class _Copies:
+    """Runs the episodes of a plan, and copies of them.
 
-    def __init__(
-        self,
-        simulation: Model,
-        policies: Mapping[Any, Any],
-        points: Points,
-        baseline: Policy,
-        metric: Metric,
-        sample: float | None,
-        method: str | None,
-        options: EpisodeOptions,
-    ) -> None:
-        if metric is not None and not callable(metric):
+    Attributes:
+        plan: The plan of the policies.
+        baseline: The baseline.
+        adds_up: Whether the baseline goes on in copies, and not the policies.
+        futures: The number of futures. None: there is one, because nothing is random.
+        metric: The metric.
+        sample: The share of the decisions that are drawn. None: all.
+        method: The method of branching.
+        horizon: The number of decisions of the agent after which its own return is read. None: the
+            return of the episode is read at its end.
+    """
+
+    plan: Plan
+    baseline: Any
+    adds_up: bool
+    futures: int | None
+    metric: Metric
+    sample: float | None
+    method: str | None
+    horizon: float | None = None
+
+    def __post_init__(self) -> None:
+        import_extra("pandas", "a ledger")
+        check_count(self.futures, "futures")
+        if not isinstance(self.baseline, Mapping):
+            self.baseline = {EVERYONE: self.baseline}
+        _check_in_copies(self.baseline)
+        self.baseline = policy_keys(self.baseline, alone=True)
+        if not (self.metric is None or callable(self.metric)):
             raise OptionValueError(
-                f"metric must be a callable of the simulation, not {short_repr(metric)}"
+                f"metric must be a callable of the simulation, not {short_repr(self.metric)}"
             )
-        if sample is not None and not (is_number(sample) and 0 < sample <= 1):
+        self.share = 1.0 if self.sample is None else self.sample
+        if not (is_number(self.share) and 0 < self.share <= 1):
             raise OptionValueError(
-                f"sample must be a share of the decisions, above 0 and up to 1, not"
-                f" {short_repr(sample)}"
+                "sample must be a share of the decisions, above 0 and up to 1, not"
+                f" {short_repr(self.sample)}"
             )
-        _check_in_copies(baseline, "baseline")
-        plan = learners_plan(simulation, policies, points, options, alone=True)
-        self._plan = replace(plan, has_planner=True)  # so that answers are kept for replays
-        self._own = _Side(self._plan)
-        named = baseline if isinstance(baseline, Mapping) else {EVERYONE: baseline}
-        self._by_rule = baseline is RULE
-        self._baseline = _Side(plan.amended({"policies": policy_keys(named, alone=True)}))
-        self._metric = metric
-        self._sample = 1.0 if sample is None else sample
-        self._method = method
 
-    @contextmanager
-    def _standing(self, seed: int) -> Iterator[tuple[Episode, _Stand, np.random.Generator]]:
-        """Begin an episode. Yield it, its view, and the generator of the sample."""
-        with outside_simulation(), reuse_resources():
-            session = Session(self._plan)
-            try:
-                episode = session.start(seed, None)
-                yield episode, _Stand.of_session(session), np.random.default_rng([seed, KEY])
-            except BaseException as error:
-                close_after(error, session.close, "the simulation")
-                raise
-            session.close()
+    def run(self, seeds: list[int]) -> Generator[tuple[_Stand, Action, bool]]:
+        """Run episodes by the policies.
 
-    def book(self, seed: int, after: str, futures: int, episodes: int) -> tuple[list[Row], float]:
-        """Run an episode. Return the rows of its decisions, and its return.
-
-        ``episodes``: the number of episodes in all, if the user must be told how long they take.
+        Yield each decision before its answer moves the simulation: the view, the answer, and
+        whether the decision is drawn. At the end of an episode, yield the view once more.
         """
-        rows: list[Row] = []
-        waiting: list[dict[str, Any]] = []  # rows that need the next value
-        then = self._baseline if after == "rule" else self._own
-        with self._standing(seed) as (episode, view, rng):
-            is_fixed = getattr(episode.simulation, "deterministic", False) is True
-            number = 0 if is_fixed else futures
-            earned = _paid(episode)
-            while episode.pending is not None:
-                agent = episode.pending
-                is_drawn = rng.random() < self._sample
-                begun = perf_counter()
-                copies = partial(self._copies, view, seed, then=then, earned=earned)
-                row: dict[str, Any] = {}
-                if is_drawn or (after == "rule" and waiting):
-                    [exact] = copies(0, first=None)
-                    if episodes:
-                        branches = exact.turns * episodes * self._sample * (1 + 2 * number)
-                        _warn_of_time(branches, branches * (perf_counter() - begun) / 2)
-                        episodes = 0
-                    ruled = _values(copies(number, first=None)) if number else [exact.value]
-                    value = np.mean(ruled)
-                    if after == "rule":
-                        _settle(waiting, exact.value, value)
-                    row = _heading(episode, agent) | {"value": value, "rule_action": exact.action}
-                labels = agent.point.action_labels(agent.choices, *agent.arguments.recall())
-                action = self._own.answer(episode)
-                if is_drawn:
-                    row["contribution"] = -exact.value
-                    row["skill"], row["luck"], row["error"] = nan, nan, 0.0
-                    if number:
-                        chosen = _values(copies(number, first=action))
-                        row["skill"] = np.mean(gains := np.subtract(chosen, ruled))
-                        row["luck"] = -np.mean(chosen)
-                        row["error"] = _error(gains)
-                    taken = exact.action if action is RULE and self._by_rule else action
-                    row["action"] = _plain(RULE if taken is None else taken)
-                    row["decision"] = _words(row["action"], labels)
-                    rows.append(row)
-                    waiting.append(row)
-                episode.step(action)
-                earned += _paid(episode)
-            total = self._return(episode, earned)
-        _settle(waiting, total, total)
-        for row in rows if is_fixed else ():
-            row["skill"], row["luck"] = row["contribution"], 0.0
-        return rows, total
+        plan = replace(self.plan, has_planner=True)  # so that answers are kept for replays
+        for seed in seeds:
+            rng = np.random.default_rng([seed, KEY])
+            with (
+                error_note(f"in the episode of seed {seed}"),
+                reuse_resources(),
+                closing(Session(plan)) as session,
+            ):
+                episode: Any = session.start(seed, None)
+                if getattr(episode.simulation, "deterministic", False) is True:
+                    self.futures = None
+                stand = _Stand.of_session(session)
+                stand.earned = _paid(episode)
+                while episode.pending:
+                    action = _answer(episode)
+                    yield stand, action, rng.random() < self.share
+                    episode.step(action)
+                    stand.earned += _paid(episode)
+                stand.earned = self._read(episode, stand.earned)
+                yield stand, RULE, False
 
-    def compare(
-        self,
-        seed: int,
-        horizon: float,
-        futures: int,
-        describe: Callable[[Decision], str] | None,
-    ) -> Iterator[tuple[list[Row], bool]]:
-        """Run an episode. Yield the rows of each decision, a row for each legal action.
-
-        And whether another action is best at twice the horizon.
-        """
-        with self._standing(seed) as (episode, view, rng):
-            is_fixed = getattr(episode.simulation, "deterministic", False) is True
-            number = 0 if is_fixed else futures
-            while episode.pending is not None:
-                agent = episode.pending
-                if rng.random() < self._sample:
-                    told = agent.describe(episode.seed, episode.where)
-                    copies = partial(self._copies, view, seed, then=self._baseline)
-                    [by_rule] = copies(0, first=RULE, horizon=0)
-                    heading = _heading(episode, agent)
-                    if describe is not None:
-                        heading["prompt"] = describe(told)
-                    rows: list[Row] = []
-                    later = []
-                    for action in _legal(agent):
-                        ends = copies(number, first=action, horizon=horizon)
-                        near = [end.near for end in ends]
-                        later.append(np.mean(_values(ends)))
-                        known = by_rule.action
-                        worth = {"value": np.mean(near), "error": _error(near) if number else 0.0}
-                        chosen = {"action": action, "label": _words(action, told.action_labels)}
-                        same = {"by_rule": None if known is None else bool(known == action)}
-                        rows.append(heading | chosen | worth | same)
-                    best = int(np.argmax([row["value"] for row in rows]))
-                    yield rows, bool(later[best] < max(later))
-                episode.step(self._own.answer(episode))
-
-    # -- copies -----------------------------------------------------------------------------------
-
-    def _copies(self, view: _Stand, seed: int, futures: int, **given: Any) -> list[_End]:
-        """Let copies go on in futures that are drawn anew; 0: one exact copy."""
-        seeds = None
-        if futures:
-            sequence = np.random.SeedSequence([seed, view.episode.turns, KEY])
-            seeds = [int(number) for number in sequence.generate_state(futures)]
-        go_on = partial(self._go_on, **given)
-        return branch(view, go_on, max(1, futures), method=self._method, seeds=seeds)
-
-    def _go_on(
-        self,
-        view: _Stand,
-        number: int,
-        *,
-        first: Action,
-        then: _Side,
-        earned: float | None = None,
-        horizon: float = inf,
-    ) -> _End:
-        """In a copy, take an action (None: that of the baseline), and go on by a side to the end.
+    def ahead(self, stand: _Stand, first: Action, futures: int | None = None) -> tuple[Any, ...]:
+        """Let copies go on to the end, or to twice the horizon.
 
         Args:
-            view: The copy.
-            number: Its number.
-            first: The action.
-            then: The side that answers from then on.
-            earned: The return so far. None: the return of the agent from here on counts, up to
-                twice the horizon.
-            horizon: The number of its decisions.
+            stand: The view.
+            first: The first action. None: that of the baseline.
+            futures: The number of copies, whose chance is drawn anew. None, 0: one exact copy.
+
+        Returns:
+            The return of each copy at the horizon, and at the end. The first action, None if it is
+            the rule's and not known. The number of decisions of the episode.
         """
-        episode: Any = view.session.episode
-        agent = _pending(episode)
-        action = self._baseline.answer(episode) if first is None else first
-        if (first is None) is not (then is self._baseline):
-            then.pass_over(episode)
-        taken = action
-        awaits = action is RULE  # until the rule's action is known
-        total, near, decisions = earned or 0.0, None, 0
-        is_alone = earned is None
+        seeds = None
+        if futures:
+            sequence = np.random.SeedSequence([stand.episode.seed, stand.episode.turns, KEY])
+            seeds = sequence.generate_state(futures).tolist()
+        go_on = partial(self._go_on, first=first)
+        ends = branch(stand, go_on, futures or 1, method=self.method, seeds=seeds)
+        near, far, (known, *_), (turns, *_) = zip(*ends, strict=True)
+        return np.array(near), np.array(far), known, turns
+
+    def _go_on(self, stand: _Stand, number: int, *, first: Action) -> tuple[Any, ...]:
+        """In a copy, take the first action, and go on."""
+        episode: Any = stand.episode
+        agent = episode.pending
+        # Also if another action is taken, because its answer may begin a round of all agents.
+        action = _answer(episode, self.baseline)
+        if first is not None:
+            action = first
+        known = action
+        is_awaited = action is RULE  # until the rule's action is known
+        horizon = self.horizon
+        earned = stand.earned if horizon is None else 0.0
+        values: list[float] = []
+        decisions = 0
         while True:
             episode.step(action)
-            is_over = episode.pending is None or (is_alone and agent.ended)
-            if not is_alone:
-                total += _paid(episode)
-            elif is_over or episode.pending is agent:
-                total += agent.reward
+            is_last = not episode.pending
+            if horizon is None:
+                earned += _paid(episode)
+            elif is_last or agent.ended or episode.pending is agent:
+                earned += agent.reward
                 decisions += 1
-            if awaits:
-                taken = agent.take_rule_action()
-                awaits = taken is None and episode.pending is not agent and not is_over
-            if near is None and decisions >= horizon:
-                near = self._return(episode, total, is_alone)
-            if is_over or (decisions >= 2 * horizon and not awaits):
-                value = self._return(episode, total, is_alone)
-                return _End(value, value if near is None else near, _plain(taken), episode.turns)
-            action = then.answer(episode)
+                is_last |= agent.ended or decisions >= 2 * horizon
+            if is_awaited:
+                known = agent.take_rule_action()
+                is_awaited = known is None and episode.pending is not agent
+            if is_last or decisions == horizon:
+                values.append(self._read(episode, earned))
+            if is_last:
+                return values[0], values[-1], _plain(known), episode.turns
+            action = _answer(episode, self.baseline if self.adds_up else None)
 
-    def _return(self, episode: Episode, earned: float, is_alone: bool = False) -> float:
-        """Return the metric, or what the agents, or the team, have earned."""
-        if self._metric is not None:
-            value = self._metric(episode.simulation)
-            if not is_number(value) or not isfinite(value):
-                raise OptionValueError(
-                    f"metric must return a finite number, not {short_repr(value)}"
-                )
-            return float(value)
-        return earned if is_alone or episode.team is None else episode.team.total
+    def _read(self, episode: Any, earned: float) -> float:
+        """Return the metric, or the rewards of the agent, the agents or the team."""
+        if self.metric is None:
+            return earned if self.horizon or not episode.team else float(episode.team.total)
+        value = self.metric(episode.simulation)
+        if not is_number(value):
+            raise OptionValueError(f"metric must return a number, not {short_repr(value)}")
+        return float(value)
 
 
-def _paid(episode: Episode) -> float:
+def _answer(episode: Any, baseline: Mapping[Any, Any] | None = None) -> Action:
+    """Answer the pending decision by its policy, or by the baseline."""
+    agent = episode.pending
+    policy = agent.policy
+    if baseline is not None:
+        names = agent.name, agent.point.hook.name, EVERYONE
+        policy = next((baseline[name] for name in names if name in baseline), RULE)
+    if policy is RULE:
+        return RULE
+    with episode.context():
+        seen = duplicate(agent.raw_observation), duplicate(agent.info)
+        answer = policy.answer(episode, agent, *seen)
+    return split_extras(answer, agent.point.definition.action_space)[0]
+
+
+def _paid(episode: Any) -> float:
     """Return the rewards that the latest step has brought. Ended agents get theirs at the end."""
-    if episode.pending is not None:
-        return episode.pending.reward
+    if episode.pending:
+        return float(episode.pending.reward)
     agents = (*episode.ended.values(), *episode.agents.values())
-    return sum(agent.reward for agent in agents)
+    return float(sum(agent.reward for agent in agents))
 
 
-def _settle(waiting: list[dict[str, Any]], value: float, mean: float) -> None:
-    """Add the next value to the rows that wait for it."""
-    for row in waiting:
-        row["contribution"] += value
-        row["luck"] += mean
-    waiting.clear()
-
-
-def _warn_of_time(branches: float, seconds: float) -> None:
-    """Tell beforehand that it takes long."""
-    if seconds > LONG:
-        warn_user(
-            f"the ledger takes about {branches:.0f} branches, and {seconds / 60:.0f} minutes; fewer"
-            ' seeds or futures, a sample=, or method="replay" for quick episodes, take less'
-        )
+def _check_in_copies(policies: Mapping[Any, Any]) -> None:
+    """Refuse policies that do not decide in copies."""
+    for policy in policies.values():
+        is_policy = policy is RULE or callable(policy)
+        if not is_policy or policy_for(policy, "", Where.CLONE) is not policy:
+            raise OptionValueError(
+                f"{short_repr(policy)} cannot decide in copies of an episode: it is no policy, or"
+                " it waits or records its answers, so that its fallback would decide; pass RULE, or"
+                " a policy that answers at once"
+            )
 
 
 # -- rows -----------------------------------------------------------------------------------------
 
 
-def _heading(episode: Episode, agent: Agent) -> dict[str, Any]:
-    """Return the first columns of the pending decision."""
-    return {
-        "seed": episode.seed,
-        "number": episode.turns + 1,
-        "agent": agent.name,
-        "time": nan if agent.now is None else agent.now,
-        "point": agent.point.hook.name,
-    }
-
-
-def _legal(agent: Agent) -> list[int]:
-    """Return the legal actions of the pending decision."""
-    space = agent.point.definition.action_space
-    if not isinstance(space, spaces.Discrete):
-        raise OptionValueError(
-            f"the values of all actions need Discrete action spaces; that of {agent.name!r} is"
-            f" {short_repr(space)}. Name other agents in policies=, or other points"
-        )
-    first = int(space.start)
-    return [action for action in range(first, first + int(space.n)) if agent.allows(action)]
-
-
-def _values(ends: Iterable[_End]) -> list[float]:
-    return [end.value for end in ends]
-
-
-def _error(sample: Sequence[float]) -> float:
+def _error(sample: Any) -> float:
     """Return the standard error of a mean; nan with fewer than two numbers."""
-    return float(np.std(sample, ddof=1)) / sqrt(len(sample)) if len(sample) > 1 else nan
+    return float(sample.std(ddof=1) / len(sample) ** 0.5) if len(sample) > 1 else nan
 
 
 def _plain(action: Action) -> Action:
@@ -654,16 +542,13 @@ def _plain(action: Action) -> Action:
     return action.tolist() if hasattr(action, "tolist") else action
 
 
-def _words(action: Action, labels: Labels) -> str:
-    """Return an action in the words of its labels."""
+def _words(action: Action, labels: Any) -> str:
+    """Return a plain action in the words of labels."""
     if action is RULE:
         return "the rule"
-    if isinstance(labels, Mapping):
-        parts = action if isinstance(action, Mapping) else None
-        if parts is None:
-            return labels.get(action, str(action))
-        return ", ".join(f"{labels[key]}: {value}" for key, value in parts.items())
-    numbers = np.ravel(action)
-    if labels is None or len(labels) != len(numbers):
+    if isinstance(action, int) and labels:
+        return str(labels.get(action))
+    if not isinstance(action, list) or not labels:
         return str(action)
-    return ", ".join(f"{label}: {value:.4g}" for label, value in zip(labels, numbers, strict=True))
+    parts = zip(labels, action, strict=False)
+    return ", ".join(f"{label}: {part:.4g}" for label, part in parts)

@@ -296,13 +296,15 @@ def test_a_sample_has_some_of_the_decisions():
 def test_the_plot_marks_ten_decisions():
     found = ledger(Fair, POLICIES, seeds=range(3), points=POINTS)
     axes = found.plot().axes[0]
-    assert len(axes.texts) == min(10, len(found.frame))
-    assert len(axes.lines) >= 3
+    words = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert len(words) == min(10, len(found.frame))
     last = found.frame[found.frame["seed"] == 0]["contribution"].sum()
     assert axes.lines[1].get_ydata()[-1] == pytest.approx(last)
     biggest = found.frame["contribution"].abs().idxmax()
-    assert found.frame["decision"][biggest] in " ".join(text.get_text() for text in axes.texts)
+    assert words[0].startswith("{agent}: {decision}".format(**found.frame.loc[biggest]))
     assert ledger(Fair, POLICIES, seeds=[1], points=POINTS, after="policy").plot().axes
+    nothing = Script(lambda simulation: None)
+    assert ledger(nothing, {"player_0": boldest}, seeds=[1], points=dice()).plot().axes
 
 
 def test_a_long_ledger_says_so_beforehand(monkeypatch):

@@ -93,7 +93,7 @@ class Ledger:
         return sums / len(self.returns)
 
     def plot(self, *, figure: Any = None) -> Any:
-        """Draw the cumulated contributions of each seed, and name the ten largest.
+        """Draw the cumulated contributions of each seed. Number and name the ten largest.
 
         With ``after="policy"`` they do not add up, and are drawn one by one. ``figure`` and the
         result are as in ``plot_timeline``.
@@ -103,17 +103,19 @@ class Ledger:
         worth = table.groupby("seed")["contribution"]
         heights = worth.cumsum() if self.after == "rule" else table["contribution"]
         with style(figure) as make_figure:
-            figure = make_figure(9.0, 4.5)
+            figure = make_figure(10.0, 4.2)
             axes = figure.subplots()
             axes.set(xlabel=along, ylabel="contributions")
             axes.axhline(0.0, **LOOKS["zero"])
             for rows in worth.groups.values():
                 axes.plot(table[along][rows], heights[rows])
-            for row in table["contribution"].abs().nlargest(10).index:
-                text = "\N{BULLET} {agent}: {decision} ({contribution:+.3g})".format(
-                    **table.loc[row]
-                )
-                axes.annotate(text, (table[along][row], heights[row]), (-2, 0), **LOOKS["number"])
+            largest = table["contribution"].abs().nlargest(10).index
+            for number, row in enumerate(largest, 1):
+                text = "{agent}: {decision} ({contribution:+.3g})".format(**table.loc[row])
+                place = table[along][row], heights[row]
+                axes.plot(*place, "k", marker=f"${number}$", markersize=9, ls="", label=text)
+            if len(largest):
+                axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
         return figure
 
 
@@ -240,7 +242,8 @@ def ledger(
                 }
                 own.append(row)
     columns = ["decision", "action", "rule_action", "value", *WORTH, "error"]
-    frame = make_table([*FIRST, *columns], rows)
+    numbers = dict.fromkeys(("time", "value", *WORTH, "error"), float)
+    frame = make_table([*FIRST, *columns], rows).astype(numbers)
     return Ledger(frame, [row["point"] for row in rows], returns, after)
 
 
@@ -332,7 +335,7 @@ def decision_values(
             " action is best; pass a longer horizon, or more futures"
         )
     columns = [*FIRST, "action", "label", "value", "error", "by_rule", "prompt"]
-    return make_table(columns if describe else columns[:-1], rows)
+    return make_table(columns if describe else columns[:-1], rows).astype({"time": float})
 
 
 # -- the engine -----------------------------------------------------------------------------------
@@ -514,7 +517,7 @@ def _paid(episode: Any) -> float:
     if episode.pending:
         return float(episode.pending.reward)
     agents = (*episode.ended.values(), *episode.agents.values())
-    return float(sum(agent.reward for agent in agents))
+    return float(sum(agent.reward for agent in agents if agent.asked))  # as evaluate counts
 
 
 def _check_in_copies(policies: Mapping[Any, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import random
+import warnings
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, evaluate, joint_env, make_step, simulate, turn_env
 from simenv_marl.data import joint_policy, turn_policy
 from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError
-from simenv_marl.experiments import decision_values, ledger, ledgers
+from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
+from simenv_marl.planning import RolloutPolicy
 from simenv_marl.seats import describe
 from tests.worlds.fairs import POINTS, POLICIES, Fair, advised, boldest
 from tests.worlds.models import Script, define
@@ -146,6 +148,43 @@ def test_a_metric_or_a_team_takes_the_place_of_rewards():
     assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
     with pytest.raises(OptionValueError, match="metric must return a number"):
         ledger(Fair, POLICIES, seeds=[1], points=POINTS, metric=lambda fair: "high")
+
+
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_generators_of_the_process_are_copied_too(driver):
+    class Thrown(Dice):
+        reseed = None
+
+        def add(self):
+            return random.randrange(10) + float(np.random.rand())
+
+    points = {Thrown.add: dice()[Dice.add]}
+    options = {"points": points, "global_rng": True, "driver": driver}
+    policies = {"player_0": lambda seen: 9}
+    found = ledger(Thrown, policies, seeds=[1], futures=2, **options)
+    made, ruled = (returns_of(Thrown, policies=each, seed=1, **options) for each in (policies, {}))
+    assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
+    assert found.frame["luck"].abs().max() > 0
+
+
+def test_planners_and_variants_have_ledgers():
+    """A planner gains 7 at each throw, on the futures that it draws."""
+    planner = {"player_0": RolloutPolicy([2, 9], futures=2, horizon=1)}
+    variant = Variant("dice", Dice, points=dice())
+    frame = ledger(variant, planner, seeds=[1], method="replay").frame
+    assert frame["contribution"].tolist() == pytest.approx([7.0] * 3)
+
+
+def test_copies_do_not_repeat_the_warnings_of_the_episode(recwarn):
+    class Loud(Dice):
+        def add(self):
+            warnings.warn("loud", UserWarning, stacklevel=1)
+            return 2
+
+    warnings.simplefilter("always")
+    points = {Loud.add: dice()[Dice.add]}
+    ledger(Loud, {"player_0": lambda seen: RULE}, seeds=[1], points=points, method="replay")
+    assert [str(warning.message) for warning in recwarn] == ["loud"] * 3
 
 
 def test_the_episode_is_that_of_the_policies():
@@ -309,7 +348,7 @@ def test_the_plot_marks_ten_decisions():
 
 def test_a_long_ledger_says_so_beforehand(monkeypatch):
     monkeypatch.setattr(ledgers, "LONG", 0.0)
-    with pytest.warns(UserWarning, match=r"about \d+ branches"):
+    with pytest.warns(UserWarning, match=r"about \d+ minutes"):
         ledger(Dice, {"player_0": lambda seen: 1}, seeds=[1], points=dice())
 
 

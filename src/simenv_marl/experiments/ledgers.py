@@ -10,6 +10,7 @@ from itertools import pairwise
 from math import inf, nan
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final
+from warnings import catch_warnings
 
 import numpy as np
 from gymnasium.spaces import Discrete
@@ -44,8 +45,8 @@ if TYPE_CHECKING:
 KEY: Final = 0x6C656467
 """Separates the seeds of futures and samples from others that follow from the episode's seed."""
 
-LONG: Final = 5.0
-"""The user is told beforehand if it will take more minutes than this."""
+LONG: Final = 300.0
+"""The user is told beforehand if it will take more seconds than this."""
 
 FIRST: Final = ("seed", "number", "agent", "time")
 
@@ -159,8 +160,8 @@ def ledger(
         policies: The policies, as ``simulate`` takes them.
         seeds: The seeds of the episodes, all different.
         points: As ``simulate`` takes them.
-        baseline: ``RULE``, a policy, or a dict of these by agent or dotted name of a point, which
-            answer in place of the policies. Agents that it does not name follow their rule.
+        baseline: ``RULE``, a policy, or policies as ``simulate`` takes them, which answer in place
+            of the policies. Agents that it does not name follow their rule.
         after: "rule": in the copy, the baseline answers all further decisions. "policy": it answers
             this one, and then the policies go on. The contribution is then the return of the
             episode less that of the copy: the worth of this decision among all the others. Such
@@ -212,12 +213,11 @@ def ledger(
             elif is_drawn or (adds_up and own and own[-1]["is_drawn"]):
                 begun = perf_counter()
                 [exact], _, known, turns = copies.ahead(stand, None)
-                branches = turns * len(all_seeds) * copies.share * (1 + 2 * futures)
-                minutes = branches * (perf_counter() - begun) / 120
-                if not (own or returns) and minutes > LONG:
+                seconds = (perf_counter() - begun) / 2 * turns * len(all_seeds) * (1 + 2 * futures)
+                if not (own or returns) and seconds * copies.share > LONG:
                     warn_user(
-                        f"the ledger takes about {branches:.0f} branches and {minutes:.0f} minutes;"
-                        " pass fewer seeds or futures, a sample=, or, for quick episodes,"
+                        f"the ledger takes about {seconds * copies.share / 60:.0f} minutes; pass"
+                        " fewer seeds or futures, a sample=, or, for quick episodes,"
                         ' method="replay"'
                     )
                 ruled, chosen = np.array([exact]), np.array([nan])
@@ -395,7 +395,7 @@ class _Copies:
         if not isinstance(self.baseline, Mapping):
             self.baseline = {EVERYONE: self.baseline}
         _check_in_copies(self.baseline)
-        self.baseline = policy_keys(self.baseline, alone=True)
+        self.ruled = self.plan.amended({"policies": policy_keys(self.baseline, alone=True)})
         if not (self.metric is None or callable(self.metric)):
             raise OptionValueError(
                 f"metric must be a callable of the simulation, not {short_repr(self.metric)}"
@@ -427,7 +427,7 @@ class _Copies:
                 stand = _Stand.of_session(session)
                 stand.earned = _paid(episode)
                 while episode.pending:
-                    action = _answer(episode)
+                    action = _answer(episode, plan)
                     yield stand, action, rng.random() < self.share
                     episode.step(action)
                     stand.earned += _paid(episode)
@@ -451,7 +451,8 @@ class _Copies:
             sequence = np.random.SeedSequence([stand.episode.seed, stand.episode.turns, KEY])
             seeds = sequence.generate_state(futures).tolist()
         go_on = partial(self._go_on, first=first)
-        ends = branch(stand, go_on, futures or 1, method=self.method, seeds=seeds)
+        with catch_warnings(action="ignore"):  # because the episode itself warns of the same
+            ends = branch(stand, go_on, futures or 1, method=self.method, seeds=seeds)
         near, far, (known, *_), (turns, *_) = zip(*ends, strict=True)
         return np.array(near), np.array(far), known, turns
 
@@ -460,7 +461,7 @@ class _Copies:
         episode: Any = stand.episode
         agent = episode.pending
         # Also if another action is taken, because its answer may begin a round of all agents.
-        action = _answer(episode, self.baseline)
+        action = _answer(episode, self.ruled)
         if first is not None:
             action = first
         known = action
@@ -485,7 +486,7 @@ class _Copies:
                 values.append(self._read(episode, earned))
             if is_last:
                 return values[0], values[-1], _plain(known), episode.turns
-            action = _answer(episode, self.baseline if self.adds_up else None)
+            action = _answer(episode, self.ruled if self.adds_up else self.plan)
 
     def _read(self, episode: Any, earned: float) -> float:
         """Return the metric, or the rewards of the agent, the agents or the team."""
@@ -497,13 +498,11 @@ class _Copies:
         return float(value)
 
 
-def _answer(episode: Any, baseline: Mapping[Any, Any] | None = None) -> Action:
-    """Answer the pending decision by its policy, or by the baseline."""
+def _answer(episode: Any, plan: Plan) -> Action:
+    """Answer the pending decision by the policies of a plan."""
     agent = episode.pending
-    policy = agent.policy
-    if baseline is not None:
-        names = agent.name, agent.point.hook.name, EVERYONE
-        policy = next((baseline[name] for name in names if name in baseline), RULE)
+    by_point = {point.hook: point.policy for point in plan.points}
+    policy: Any = plan.policies.get(agent.name) or by_point.get(agent.point.hook) or RULE
     if policy is RULE:
         return RULE
     with episode.context():

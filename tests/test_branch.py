@@ -29,6 +29,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, branch, clone, single_env
+from simenv_marl.core.copies import separation
 from simenv_marl.core.copies.separation import event_loops
 from simenv_marl.core.episodes import episode as run
 from simenv_marl.errors import (
@@ -608,3 +609,19 @@ def test_seeds_without_a_reseed_raise_an_error_with_the_remedy(monkeypatch, meth
         with pytest.raises(BranchError, match=r"reseed\(seed\)[\s\S]*global_rng=True"):
             branch(env, never, 2, method=method, seeds=[1, 2])
         env.step(1)
+
+
+def test_a_file_that_the_collector_closes_in_a_fork_is_left_out(monkeypatch, tmp_path):
+    """Garbage, such as the fonts of plots, may go at any time in the fork."""
+    env = trip()
+    replace = separation._replace
+    with (tmp_path / "notes").open("w+") as file:
+
+        def collect_and_replace(openings, path):
+            if any(file.fileno() in opening.descriptors for opening in openings):
+                os.close(file.fileno())
+            replace(openings, path)
+
+        monkeypatch.setattr(separation, "_replace", collect_and_replace)
+        assert branch(env, lambda twin, number: number, 2, method="fork") == [0, 1]
+    env.close()

@@ -1,4 +1,7 @@
-"""Draw the plots of episodes on the page ``experiments.md``: ``python docs/figures/looking.py``."""
+"""Draw the plots of the pages ``experiments.md`` and ``ledger.md``.
+
+``python docs/figures/looking.py`` runs the examples of both.
+"""
 
 from __future__ import annotations
 
@@ -63,17 +66,22 @@ def boats() -> Any:
     )
 
 
-def main() -> None:
-    """Run the examples of the page, and save their figures and that of the boats."""
-    sys.path.insert(0, str(HERE.parent))  # for the models beside the page
+def names_of(page: str) -> dict[str, Any]:
+    """Run the examples of a page. Return their names."""
     names: dict[str, Any] = {"__name__": "__main__"}
-    for example in DocTestParser().get_examples(
-        (HERE.parent / "experiments.md").read_text(encoding="utf-8")
-    ):
-        exec(compile(example.source, "experiments.md", "exec"), names)
-    names["lake"] = boats()
+    text = (HERE.parent / page).read_text(encoding="utf-8")
+    for example in DocTestParser().get_examples(text):
+        exec(compile(example.source, page, "exec"), names)
+    return names
+
+
+def main() -> None:
+    """Run the examples of the pages, and save their figures and that of the boats."""
+    sys.path[:0] = [str(HERE.parent), str(HERE.parents[1])]  # models, and examples
+    names = names_of("experiments.md") | {"lake": boats()}
     for name in ("shop", "lake", "returns"):
         names[name].savefig(HERE / f"looking-{name}.png", dpi=100)
+    names_of("ledger.md")["figure"].savefig(HERE / "ledger.png", dpi=100)
 
 
 if __name__ == "__main__":

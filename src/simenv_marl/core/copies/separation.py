@@ -260,5 +260,6 @@ def _replace(openings: list[_Opening], path: str) -> None:
         again = os.open(path, opening.flags)
         os.lseek(again, opening.offset, os.SEEK_SET)
         for number in opening.descriptors:
-            os.dup2(again, number, inheritable=os.get_inheritable(number))
+            with suppress(OSError):  # the garbage collector has closed it since
+                os.dup2(again, number, inheritable=os.get_inheritable(number))
         os.close(again)

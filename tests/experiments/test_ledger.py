@@ -1,0 +1,461 @@
+"""What each decision was worth."""
+
+import os
+import random
+import warnings
+
+import numpy as np
+import pytest
+from examples.greenhouse_coop.env import WATERER, GreenhouseSim
+from examples.queue_admission.env import AGENT, QueueSimulation
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import RULE, evaluate, joint_env, make_step, simulate, turn_env
+from simenv_marl.data import joint_policy, turn_policy
+from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError
+from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
+from simenv_marl.planning import RolloutPolicy
+from simenv_marl.seats import describe
+from tests.worlds.fairs import POINTS, POLICIES, Fair, advised, boldest
+from tests.worlds.models import Script, define
+
+COLUMNS = [
+    "seed", "number", "agent", "time", "decision", "action", "rule_action", "value",
+    "contribution", "skill", "luck", "error",
+]  # fmt: skip
+
+WORLDS = int(os.environ.get("LEDGER_WORLDS", "12"))
+"""The bar is 1,000 worlds, which take some minutes."""
+
+seeds = st.integers(0, 2**31 - 1)
+
+
+class Dice:
+    """Three throws: who decides adds to each, and its rule adds 2."""
+
+    deterministic = False
+
+    def reset(self, seed=None):
+        self.random = random.Random(seed)
+        self.total = self.last = 0.0
+
+    def run(self):
+        for _ in range(3):
+            self.last = self.add() + 10 * self.random.random()
+            self.total += self.last
+
+    def add(self):
+        return 2
+
+    def reseed(self, seed):
+        self.random.seed(seed)
+
+
+def dice(**changes):
+    """The decision point of dice: ten actions, paid by the throw."""
+    given = {
+        "agent": "player_0",
+        "action_space_mapping": {number: number for number in range(10)},
+        "reward_mapping": lambda dice: dice.last,
+    }
+    return {Dice.add: define(**given | changes)}
+
+
+def returns_of(simulation, points, policies, seed, **options):
+    """The team's return of policies, without a ledger."""
+    found = evaluate(simulation, {"policies": policies}, seeds=[seed], points=points, **options)
+    return found.values().loc[seed, "policies"]
+
+
+# -- sums -----------------------------------------------------------------------------------------
+
+
+@given(
+    seed=seeds,
+    driver=st.sampled_from(["greenlet", "thread"]),
+    method=st.sampled_from([None, "replay"]),
+    forced=st.booleans(),
+    steps=st.none() | st.integers(1, 12),
+)
+@settings(max_examples=WORLDS)
+def test_contributions_add_up_to_the_difference(seed, driver, method, forced, steps):
+    options = {"points": POINTS, "skip_forced": forced, "max_steps": steps, "driver": driver}
+    found = ledger(Fair, POLICIES, seeds=[seed], method=method, **options)
+    made = returns_of(Fair, policies=POLICIES, seed=seed, **options)
+    ruled = returns_of(Fair, policies=dict.fromkeys(POINTS, RULE), seed=seed, **options)
+    assert found.returns[seed] == pytest.approx(made, abs=1e-9)
+    assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
+    if len(found.frame):
+        assert found.frame["value"][0] == pytest.approx(ruled, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_the_baseline_may_be_any_policies(method):
+    for baseline in (boldest, dict.fromkeys(POINTS, boldest), {"warden_0": boldest}):
+        by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(POINTS, baseline)
+        found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, baseline=baseline, method=method)
+        expected = returns_of(Fair, POINTS, {**dict.fromkeys(POINTS, RULE), **by_point}, 5)
+        difference = found.returns[5] - expected
+        assert found.frame["contribution"].sum() == pytest.approx(difference, abs=1e-9)
+
+
+def test_policies_of_all_agents_decide_in_copies_too():
+    """The learner of a turn view, and that of a joint view, whose answers are for a round."""
+    roster = {next(iter(POINTS)): [f"stall_{number}" for number in range(6)]}
+    turns = turn_policy(
+        lambda seen, info: int(info["action_mask"].argmax()),
+        like=turn_env(Fair, POINTS, possible_agents=roster),
+    )
+    joint = joint_policy(
+        lambda seen: dict.fromkeys(seen, seen[WATERER][4:5] / 4), like=joint_env(GreenhouseSim)
+    )
+    both = {WATERER: RULE, "ventilator_0": RULE}
+    short = {"max_steps": 7}
+    for simulation, points, rules, policies in (
+        (Fair, POINTS, dict.fromkeys(POINTS, RULE), turns),
+        (GreenhouseSim, None, both, joint),
+    ):
+        there = ledger(simulation, policies, seeds=[3], points=points, **short)
+        back = ledger(simulation, rules, seeds=[3], points=points, baseline=policies, **short)
+        made = returns_of(simulation, points, policies, 3, **short)
+        ruled = returns_of(simulation, points, rules, 3, **short)
+        assert there.frame["value"][0] == pytest.approx(ruled, abs=1e-9)
+        assert back.frame["value"][0] == pytest.approx(made, abs=1e-9)
+        total = there.frame["contribution"].sum()
+        assert total == pytest.approx(made - ruled, abs=1e-9)
+        assert back.frame["contribution"].sum() == pytest.approx(-total, abs=1e-9)
+        once = ledger(simulation, policies, seeds=[3], points=points, after="policy", **short)
+        assert len(once.frame) == len(there.frame)
+
+
+def test_a_metric_or_a_team_takes_the_place_of_rewards():
+    def worth(fair):
+        return fair.fortune
+
+    found = ledger(Fair, POLICIES, seeds=[1, 2], points=POINTS, metric=worth)
+    for seed in (1, 2):
+        made = worth(simulate(Fair, POLICIES, points=POINTS, seed=seed))
+        ruled = worth(simulate(Fair, seed=seed))
+        assert found.returns[seed] == made
+        own = found.frame[found.frame["seed"] == seed]
+        assert own["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
+    team = {"team_reward": worth}
+    found = ledger(Fair, POLICIES, seeds=[1], points=POINTS, **team)
+    made = returns_of(Fair, POINTS, POLICIES, 1, **team)
+    ruled = returns_of(Fair, POINTS, {}, 1, **team)
+    assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
+    with pytest.raises(OptionValueError, match="metric must return a number"):
+        ledger(Fair, POLICIES, seeds=[1], points=POINTS, metric=lambda fair: "high")
+
+
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_generators_of_the_process_are_copied_too(driver):
+    class Thrown(Dice):
+        reseed = None
+
+        def add(self):
+            return random.randrange(10) + float(np.random.rand())
+
+    points = {Thrown.add: dice()[Dice.add]}
+    options = {"points": points, "global_rng": True, "driver": driver}
+    policies = {"player_0": lambda seen: 9}
+    found = ledger(Thrown, policies, seeds=[1], futures=2, **options)
+    made, ruled = (returns_of(Thrown, policies=each, seed=1, **options) for each in (policies, {}))
+    assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
+    assert found.frame["luck"].abs().max() > 0
+
+
+def test_planners_and_variants_have_ledgers():
+    """A planner gains 7 at each throw, on the futures that it draws."""
+    planner = {"player_0": RolloutPolicy([2, 9], futures=2, horizon=1)}
+    variant = Variant("dice", Dice, points=dice())
+    frame = ledger(variant, planner, seeds=[1], method="replay").frame
+    assert frame["contribution"].tolist() == pytest.approx([7.0] * 3)
+
+
+def test_copies_do_not_repeat_the_warnings_of_the_episode(recwarn):
+    class Loud(Dice):
+        def add(self):
+            warnings.warn("loud", UserWarning, stacklevel=1)
+            return 2
+
+    warnings.simplefilter("always")
+    points = {Loud.add: dice()[Dice.add]}
+    ledger(Loud, {"player_0": lambda seen: RULE}, seeds=[1], points=points, method="replay")
+    assert [str(warning.message) for warning in recwarn] == ["loud"] * 3
+
+
+def test_the_episode_is_that_of_the_policies():
+    for futures in (0, 2):
+        found = ledger(Fair, POLICIES, seeds=[4], points=POINTS, futures=futures)
+        assert found.returns[4] == pytest.approx(returns_of(Fair, POINTS, POLICIES, 4))
+
+
+# -- the rule decides once ------------------------------------------------------------------------
+
+
+def test_the_rule_decides_once_and_then_the_policy():
+    found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, after="policy")
+    assert len(found.frame) > 4
+    for place, value in enumerate(found.frame["value"]):
+        counted = iter(range(1000))
+
+        def one_by_rule(observation, info, *, place=place, counted=counted):
+            return RULE if next(counted) == place else advised(observation, info)
+
+        expected = returns_of(Fair, POINTS, dict.fromkeys(POINTS, one_by_rule), 5)
+        assert value == pytest.approx(expected, abs=1e-9)
+    worth = found.returns[5] - found.frame["value"]
+    assert found.frame["contribution"].tolist() == worth.tolist()
+
+
+def test_planted_mistakes_are_among_the_worst():
+    mistakes = set(range(5, 95, 9))
+
+    def careful(observation):
+        if round(float(observation[3]) * 100) in mistakes:
+            return [0.5]
+        return [min(1.0, max(0.0, 0.33 - 0.6 * float(observation[4])))]
+
+    frame = ledger(GreenhouseSim, {WATERER: careful}, seeds=[1, 2], after="policy").frame
+    for _, own in frame.groupby("seed"):
+        worst = own.nsmallest(10, "contribution")
+        assert len({number - 1 for number in worst["number"]} & mistakes) >= 9
+
+
+# -- skill and luck -------------------------------------------------------------------------------
+
+
+def test_skill_and_luck_are_apart():
+    found = ledger(Dice, {"player_0": lambda seen: 5}, seeds=[1, 2], points=dice(), futures=6)
+    frame = found.frame
+    assert frame["skill"].tolist() == pytest.approx([3.0] * 6)  # chance is common
+    assert frame["error"].tolist() == pytest.approx([0.0] * 6, abs=1e-9)
+    assert frame["luck"].abs().min() > 0.01
+    assert frame["contribution"].tolist() == pytest.approx([3.0] * 6)
+    for seed, own in frame.groupby("seed"):
+        total = own["value"].iloc[0] + own["skill"].sum() + own["luck"].sum()
+        assert total == pytest.approx(found.returns[seed], abs=1e-9)
+
+
+@given(seed=seeds)
+@settings(max_examples=4)
+def test_value_skill_and_luck_add_up_to_the_return(seed):
+    found = ledger(Fair, POLICIES, seeds=[seed], points=POINTS, futures=3)
+    if len(found.frame):
+        sums = found.frame[["skill", "luck"]].sum().sum()
+        assert found.frame["value"][0] + sums == pytest.approx(found.returns[seed], abs=1e-9)
+    once = ledger(Fair, POLICIES, seeds=[seed], points=POINTS, futures=2, after="policy").frame
+    total = once["value"] + once["skill"] + once["luck"]
+    assert total.tolist() == pytest.approx([found.returns[seed]] * len(once))
+
+
+def test_where_nothing_is_random_all_is_skill():
+    class Fixed(Dice):
+        deterministic = True
+
+        def reset(self, seed=None):
+            super().reset(0)
+
+        def reseed(self, seed):
+            raise AssertionError("there is one future")
+
+    for futures in (0, 4):
+        frame = ledger(
+            Fixed, {"player_0": lambda seen: 1}, seeds=[1], points=dice(), futures=futures
+        ).frame
+        assert frame["skill"].tolist() == frame["contribution"].tolist()
+        assert frame[["luck", "error"]].to_numpy().tolist() == [[0.0, 0.0]] * 3
+    frame = ledger(Dice, {"player_0": lambda seen: 1}, seeds=[1], points=dice()).frame
+    assert frame[["skill", "luck"]].isna().all(axis=None)
+    assert frame["error"].tolist() == [0.0] * 3
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+def test_the_frame_tells_decisions_in_words():
+    policies = {AGENT: lambda seen: 1 - int(seen[1])}
+    found = ledger(QueueSimulation, policies, seeds=[3, 4], max_steps=20)
+    frame = found.frame
+    assert list(frame.columns) == COLUMNS
+    assert frame["number"].tolist() == [*range(1, 21)] * 2
+    assert set(frame["agent"]) == {AGENT}
+    assert set(frame["rule_action"]) == {1}
+    assert frame["time"].is_monotonic_increasing is False
+    assert frame["time"][:20].is_monotonic_increasing
+    words = {0: "turn it away", 1: "let it in"}
+    assert [words[action] for action in frame["action"]] == frame["decision"].tolist()
+    summary = found.summary()
+    assert summary.index.names == ["agent", "point"]
+    [(agent, point)] = summary.index
+    assert (agent, point) == (AGENT, "examples.queue_admission.model.Queue.admit")
+    sums = frame.groupby("seed")["contribution"].sum()
+    assert summary["contribution"].iloc[0] == pytest.approx(sums.mean())
+    assert summary["decisions"].iloc[0] == 20
+
+
+def test_boxes_and_the_rule_have_words_too():
+    policies = {WATERER: lambda seen: [0.06] if seen[3] < 0.02 else RULE}
+    frame = ledger(GreenhouseSim, policies, seeds=[1], max_steps=4).frame
+    assert (
+        frame["decision"].tolist()
+        == ["share of 1000 litres: 0.06"] * 2 + ["share of 1000 litres: 0.2"] * 2
+    )
+    assert [*map(len, frame["action"])] == [1] * 4
+    assert frame["action"].str[0].tolist() == pytest.approx([0.06, 0.06, 0.2, 0.2])
+    assert frame["rule_action"].str[0].tolist() == pytest.approx([0.2] * 4)
+    assert frame["time"].isna().all()
+    assert frame["contribution"].tolist()[2:] == [0.0, 0.0]
+
+
+def test_without_a_decision_the_frame_is_empty():
+    simulation = Script(lambda simulation: None)
+    found = ledger(simulation, {"player_0": lambda seen: 0}, seeds=[1], points=dice())
+    assert list(found.frame.columns) == COLUMNS
+    assert len(found.frame) == 0
+    assert len(found.summary()) == 0
+
+
+def test_a_sample_has_some_of_the_decisions():
+    given = {"seeds": range(4), "points": POINTS, "futures": 2, "method": "replay"}
+    whole = ledger(Fair, POLICIES, **given).frame
+    some = ledger(Fair, POLICIES, **given, sample=0.3).frame
+    again = ledger(Fair, POLICIES, **given, sample=0.3).frame
+    assert 0 < len(some) < len(whole)
+    assert some.equals(again)
+    both = some.merge(whole, on=["seed", "number"], suffixes=("", "_whole"))
+    assert len(both) == len(some)
+    for name in ("value", "contribution", "skill", "luck"):
+        assert both[name].tolist() == both[f"{name}_whole"].tolist()
+
+
+def test_the_plot_marks_ten_decisions():
+    found = ledger(Fair, POLICIES, seeds=range(3), points=POINTS)
+    axes = found.plot().axes[0]
+    words = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert len(words) == min(10, len(found.frame))
+    last = found.frame[found.frame["seed"] == 0]["contribution"].sum()
+    assert axes.lines[1].get_ydata()[-1] == pytest.approx(last)
+    biggest = found.frame["contribution"].abs().idxmax()
+    assert words[0].startswith("{agent}: {decision}".format(**found.frame.loc[biggest]))
+    assert ledger(Fair, POLICIES, seeds=[1], points=POINTS, after="policy").plot().axes
+    nothing = Script(lambda simulation: None)
+    assert ledger(nothing, {"player_0": boldest}, seeds=[1], points=dice()).plot().axes
+
+
+def test_a_long_ledger_says_so_beforehand(monkeypatch):
+    monkeypatch.setattr(ledgers, "LONG", 0.0)
+    with pytest.warns(UserWarning, match=r"about \d+ minutes"):
+        ledger(Dice, {"player_0": lambda seen: 1}, seeds=[1], points=dice())
+
+
+def test_wrong_arguments_are_refused():
+    given = {"seeds": [1], "points": dice()}
+    policies = {"player_0": lambda seen: 1}
+    for wrong, text in (
+        ({"after": "chance"}, 'after must be "rule" or "policy"'),
+        ({"futures": -1}, "futures must be an integer"),
+        ({"sample": 0}, "sample must be a share"),
+        ({"sample": 1.5}, "sample must be a share"),
+        ({"metric": 3}, "metric must be a callable"),
+        ({"seeds": [1, 1]}, "occurs twice"),
+        ({"baseline": "rule"}, "it is no policy"),
+    ):
+        with pytest.raises((OptionValueError, TypeError), match=text):
+            ledger(Dice, policies, **given | wrong)
+
+    async def slow(observation):
+        return 1
+
+    with pytest.raises(OptionValueError, match="fallback"):
+        ledger(Dice, policies, baseline=slow, **given)
+    with pytest.raises(OptionValueError, match="fallback"):
+        ledger(Dice, {"player_0": slow}, after="policy", **given)
+    assert len(ledger(Dice, {"player_0": slow}, **given).frame) == 3
+    with pytest.raises(InvalidActionError):
+        ledger(Dice, {"player_0": lambda seen: 99}, **given)
+
+    class Unseeded(Dice):
+        reseed = None
+
+    with pytest.raises(BranchError, match="reseed"):
+        ledger(Unseeded, policies, futures=2, **given)
+
+
+# -- decision values ------------------------------------------------------------------------------
+
+
+def test_each_legal_action_has_a_value():
+    found = decision_values(
+        Dice, seeds=[1, 2], points=dice(), futures=4, describe=describe, method="replay"
+    )
+    assert list(found.columns) == [
+        "seed", "number", "agent", "time", "action", "label", "value", "error", "by_rule", "prompt",
+    ]  # fmt: skip
+    assert len(found) == 2 * 3 * 10
+    first = found[(found["seed"] == 1) & (found["number"] == 1)]
+    gains = first["value"] - first["value"].iloc[0]
+    assert gains.tolist() == pytest.approx([*range(10)])
+    assert first["by_rule"].tolist() == [action == 2 for action in range(10)]
+    assert first["label"].tolist() == [str(action) for action in range(10)]
+    assert first["prompt"].nunique() == 1
+    assert "0: 0" in first["prompt"].iloc[0] or "9" in first["prompt"].iloc[0]
+    assert "prompt" not in decision_values(Dice, seeds=[1], points=dice(), futures=0)
+
+
+def test_masked_actions_have_no_row_and_policies_play():
+    warden = {"warden_0": boldest}
+    found = decision_values(Fair, warden, seeds=[1, 3], points=POINTS, futures=2)
+    assert set(found["agent"]) == {"warden_0"}
+    chosen = ledger(Fair, warden, seeds=[1, 3], points=POINTS).frame
+    last = found.groupby(["seed", "number"])["action"].max()
+    assert last.tolist() == chosen["action"].tolist()
+    exact = decision_values(Fair, warden, seeds=[1, 3], points=POINTS, futures=0)
+    assert exact["error"].tolist() == [0.0] * len(exact)
+
+
+def test_a_horizon_counts_decisions_of_the_agent():
+    class Later(Dice):
+        """A high number pays at once, and costs more at the second decision after it."""
+
+        def run(self):
+            values = []
+            for number in range(5):
+                values.append(self.add())
+                before = values[number - 1] if number else 0
+                self.last = values[-1] - 3.0 * before
+
+    points = {Later.add: dice()[Dice.add]}
+    given = {"seeds": [1], "points": points, "futures": 0, "method": "replay"}
+    with pytest.warns(UserWarning, match="best action changes"):
+        near = decision_values(Later, horizon=1, **given)
+    far = decision_values(Later, horizon=2, **given)
+    best = near.loc[near.groupby("number")["value"].idxmax(), "action"]
+    assert best.tolist()[:4] == [9] * 4
+    best = far.loc[far.groupby("number")["value"].idxmax(), "action"]
+    assert best.tolist()[:4] == [0] * 4
+
+
+def test_values_of_a_metric_are_read_at_the_horizon():
+    totals = decision_values(
+        Dice, seeds=[1], points=dice(), futures=0, horizon=1, metric=lambda dice: dice.last
+    )
+    first = totals[totals["number"] == 1]["value"].to_numpy()
+    assert np.diff(first).tolist() == pytest.approx([1.0] * 9)
+
+
+def test_actions_that_cannot_be_listed_are_refused():
+    with pytest.raises(OptionValueError, match="Discrete"):
+        decision_values(GreenhouseSim, seeds=[1])
+    with pytest.raises(OptionValueError, match="horizon must be"):
+        decision_values(Dice, seeds=[1], points=dice(), horizon=0)
+    unknown = {Dice.add: make_step(
+        observation_space=spaces.Box(-1, 1, (1,)), observation_space_mapping=lambda dice: [0],
+        action_space=spaces.Discrete(2), action_space_mapping=lambda action: action,
+        reward_mapping=lambda dice: dice.last, agent="player_0",
+    )}  # fmt: skip
+    found = decision_values(Dice, seeds=[1], points=unknown, futures=0)
+    assert found["by_rule"].tolist() == [None] * 6

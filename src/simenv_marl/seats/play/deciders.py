@@ -90,6 +90,7 @@ def _answer(
         episode = SimpleNamespace(
             where=Where.USER,
             seed=episode.seed,
+            simulation=episode.simulation,
             planner_view=episode.planner_view,
             read_state=episode.read_state,
         )

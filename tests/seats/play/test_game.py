@@ -28,6 +28,7 @@ from simenv_marl.seats.play.forms import (
 from simenv_marl.seats.play.game import Game
 from simenv_marl.seats.play.host import Host, Rules
 from simenv_marl.seats.play.recording import read
+from tests.planning.test_candidates import Works, points
 from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
 from tests.worlds import models
 
@@ -470,6 +471,17 @@ def test_a_display_is_shown_in_place_of_the_observation(make_host):
         [{"label": "day", "text": "1 d", "number": 1.0}],
     )
     assert think(host)["measures"] == ["your points", "day"]
+
+
+def test_futures_of_all_answers_have_the_same_duration(make_host):
+    class Mill(Works):
+        points = points()
+
+    host = make_host(Mill, seats=("machine",), policies={"watchman": lambda observation: 0})
+    settle(host)
+    host.handle("machine", {"do": "horizon", "n": 2.5, "by": "time"})
+    for candidate in think(host)["candidates"]:
+        assert [row[-1] for row in candidate["bands"][0]] == pytest.approx([-2.5] * 3)
 
 
 def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):

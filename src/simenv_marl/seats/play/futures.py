@@ -268,8 +268,8 @@ class Futures(Exploration):
                         if candidate.action is None and "rule_action" in info:
                             self._note_rule(info["rule_action"])
                     span = info.get("time", self._start) - self._start
-                    is_far = self._horizon.is_reached(len(course) - 1, span)
-                    if is_far or (agent == own and ended):
+                    # Up to an own decision, because the share of its interval counts by its time.
+                    if agent == own and (ended or self._horizon.is_reached(len(course) - 1, span)):
                         break
                     yield
         except Exception as error:

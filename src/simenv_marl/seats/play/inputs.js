@@ -2,10 +2,12 @@
 
 import { $, make, show } from "./charts.js";
 
+const RULE_KEY = "r"; // at each decision, because people press what they have learned
+
 // A key for each text: the number with which it begins, else one of its letters.
 function keysFor(texts) {
   const keys = texts.map((text) => /^(\d)(?!\S*\d)/.exec(text)?.[1] ?? "");
-  const used = new Set();
+  const used = new Set([RULE_KEY]);
   keys.forEach((key, i) => { if (used.has(key)) keys[i] = ""; used.add(key); });
   texts.forEach((text, i) => {
     if (keys[i]) return;
@@ -41,10 +43,9 @@ export class Answers {
     $("inputs").replaceChildren(...this.fields.map((field) => field.element));
     $("answers").replaceChildren();
     $("candidates").replaceChildren();
-    const texts = (form.cards ?? []).map((card) => card.text);
-    const keys = keysFor([...texts, "By the rule"]);
+    const keys = keysFor((form.cards ?? []).map((card) => card.text));
     (form.cards ?? []).forEach((card, i) => this.card(card.action, card.text, keys[i], $("answers")));
-    this.card(null, "By the rule", keys.at(-1), form.cards ? $("answers") : $("candidates"));
+    this.card(null, "By the rule", RULE_KEY, form.cards ? $("answers") : $("candidates"));
     if (last !== null) this.fill(last);
   }
 

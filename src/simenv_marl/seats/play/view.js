@@ -34,6 +34,8 @@ function drawHead() {
   const { state, seat } = page;
   $("title").textContent = state.title;
   $("seat").textContent = inLobby() ? "" : seat || (seat === "" ? "facilitator" : "watching");
+  const points = inLobby() ? undefined : state.returns[seat];
+  $("standing").textContent = points === undefined ? "" : `${show(points)} points`;
   document.title = `${mine() ? "● " : ""}${state.title}`;
   const second = seat && page.people.taken[seat] > 1 ? `This seat is open in ${page.people.taken[seat]} pages. ` : "";
   const event = second + (state.event || "");

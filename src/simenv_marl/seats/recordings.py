@@ -3,11 +3,12 @@
 import json
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
@@ -68,6 +69,12 @@ The question is the ``seed``, the ``agent``, the ``number`` of the decision, dig
 ``Outcome`` as JSON. ``run`` is the recording that has written the line.
 """
 
+Asked = tuple[str, str | None]
+"""The digests of an observation and of the legal actions, which older recordings do not have."""
+
+Answers = dict[Asked, list[Entry]]
+"""The entries of an agent and a seed, in the order of the lines."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -109,7 +116,7 @@ class Recording(Lines):
                 f"{self.path} cannot be written: {self.path.parent} is no folder"
             )
         self._run = uuid4().hex[:12]
-        self._entries: dict[tuple[int, str], list[Entry]] | None = None
+        self._entries: dict[tuple[int, str], Answers] | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Return the state without the entries, because the file has them, too."""
@@ -122,20 +129,19 @@ class Recording(Lines):
             OptionValueError: Another policy has answered it, or the file has only answers to other
                 decisions of this agent in this episode.
         """
+        answers = self._entries_of(question)
         given = self._given(decision)
-        others = []
-        for place, entry in enumerate(self._entries_of(question)):
-            if place in given:
-                continue
-            is_same = entry["observation"] == question["observation"]
-            if is_same and entry.get("legal") in (None, question["legal"]):
+        seen = question["observation"]
+        for key in ((seen, question["legal"]), (seen, None)):  # older versions have no second part
+            if given[key] < len(answers[key]):
+                entry = answers[key][given[key]]
                 self._check_policy(question, entry)
-                given.add(place)
+                given[key] += 1
                 return _outcome_in(entry, decision.action_space)
-            if entry.get("run") != self._run:
-                others.append(entry["observation"])
+        left = chain.from_iterable(entries[given[key] :] for key, entries in answers.items())
+        others = [entry["observation"] for entry in left if entry.get("run") != self._run]
         if others:
-            is_seen = question["observation"] in others
+            is_seen = seen in others
             problem = "its legal actions" if is_seen else "its observation"
             raise OptionValueError(
                 f"{self.path} has no answer to decision {question['number']} of"
@@ -155,23 +161,24 @@ class Recording(Lines):
         optional = ("policy", "extras", "why", "counts")
         entry = {name: part for name, part in entry.items() if part or name not in optional}
         self.append(entry)
-        entries = self._entries_of(question)
-        self._given(decision).add(len(entries))
+        key = question["observation"], question["legal"]
+        entries = self._entries_of(question)[key]
         entries.append(entry)
+        self._given(decision)[key] = len(entries)
 
-    def _given(self, decision: Decision) -> set[int]:
-        """Return the places of the lines that this agent has been given in this episode."""
-        given: set[int] = decision.memory.setdefault(self._run, set())
+    def _given(self, decision: Decision) -> Counter[Asked]:
+        """Return how many entries of each kind this agent has been given in this episode."""
+        given: Counter[Asked] = decision.memory.setdefault(self._run, Counter())
         return given
 
-    def _entries_of(self, question: Entry) -> list[Entry]:
+    def _entries_of(self, question: Entry) -> Answers:
         """Return the entries of the agent and the seed of a decision."""
         if self._entries is None:
-            self._entries = defaultdict(list)
+            self._entries = defaultdict(lambda: defaultdict(list))
             for number, entry in self.read() if self.path.exists() else ():
                 try:
-                    seed, agent, _ = (entry[name] for name in ("seed", "agent", "observation"))
-                    self._entries[seed, agent].append(entry)
+                    seed, agent, seen = (entry[name] for name in ("seed", "agent", "observation"))
+                    self._entries[seed, agent][seen, entry.get("legal")].append(entry)
                 except (TypeError, LookupError):
                     warn_user(f"line {number} of {self.path} is no answer, and is left out")
         return self._entries[question["seed"], question["agent"]]

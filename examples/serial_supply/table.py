@@ -3,7 +3,7 @@
 ``python -m examples.serial_supply.table`` trains each learner five times, and evaluates all on the
 same 200 seeds. It writes ``out/table.csv`` and ``out/gains.csv`` beside this file, and
 ``docs/figures/serial-supply.png``. Policies and finished episodes stay in ``out``: run again, it
-does what is missing. It needs the extra ``clients``, and up to two hours on one core.
+does what is missing. It needs the extra ``clients``, and an hour and a half on one core.
 """
 
 from __future__ import annotations

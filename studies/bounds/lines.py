@@ -29,7 +29,7 @@ EVERY: Final = 200
 HORIZON: Final = 200
 """The horizon, which is long enough for ten parts."""
 
-CONSTANTS: Final = (16, 18, 19, 20, 22, 26, 30)
+CONSTANTS: Final[tuple[int, ...]] = (16, 18, 19, 20, 22, 26, 30)
 """The constant waiting times that are tried."""
 
 PLAN: Final = "plan, held to the horizon"
@@ -73,13 +73,13 @@ LINES: Final = {
 def main(arguments: Sequence[str] | None = None) -> list[list[Any]]:
     """Measure the rules and the plan, and write the table and the figure."""
     options = options_of("Plan production lines.", arguments, seeds=8, futures=4)
-    lines, constants = LINES, CONSTANTS
+    constants = CONSTANTS
     if options.quick:
         options.seeds, options.futures, constants = 1, 1, (19,)
         Line.end = 200
     rows: list[list[Any]] = []
     table: list[list[Any]] = []
-    for name, (kind, published) in lines.items():
+    for name, (kind, published) in LINES.items():
         policies: dict[str, Any] = {f"always {each}": constant(each) for each in constants}
         policies["the package's heuristic, knows the time"] = best_known
         policies[PLAN] = planner(futures=options.futures)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import tqdm
+import tqdm  # type: ignore[import-untyped]
 
 from ..report import markdown, new_figure
 

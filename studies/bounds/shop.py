@@ -143,8 +143,8 @@ class Priority:
 
     def near(self, random: Random) -> Priority:
         """Return a rule with other weights."""
-        weights = [random.gauss(each, 1.0) for each in (self.share, self.work, self.load)]
-        return Priority(*weights, random.gauss(self.power, 0.3))
+        share, work, load = (random.gauss(x, 1.0) for x in (self.share, self.work, self.load))
+        return Priority(share, work, load, random.gauss(self.power, 0.3))
 
 
 SHORT: Final = Priority(share=1.0)

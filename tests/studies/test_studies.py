@@ -140,6 +140,21 @@ def test_bounds_plans_production_lines(tmp_path, capsys):
     check_bounds(table, tmp_path, capsys.readouterr().out, files)
 
 
+def test_bounds_plans_inventories(tmp_path, capsys):
+    pytest.importorskip("gym_invmgmt")
+    from studies.bounds import inventory
+
+    table = inventory.main(["--quick", "--out", str(tmp_path)])
+    check_bounds([["plan"], *table], tmp_path, capsys.readouterr().out, ["bounds-inventory.png"])
+
+
+def test_bounds_has_the_rule_of_the_inventory_benchmark():
+    pytest.importorskip("gym_invmgmt")
+    from studies.bounds.warehouse import Warehouse
+
+    assert simulate(Warehouse, seed=42).profit == pytest.approx(1275.4, abs=0.05)  # published
+
+
 def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
     pytest.importorskip("mesa")
     from studies.wolf_sheep import plan as sheep

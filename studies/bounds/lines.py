@@ -23,11 +23,11 @@ from simenv_marl.planning import RolloutPolicy
 from .measured import cpu_seconds, draw, options_of, show, write
 from .waiting_line import STEP, JumpingLine, Line, best_known
 
-EVERY: Final = 200
+EVERY: Final = 100
 """The time between two plans."""
 
-HORIZON: Final = 200
-"""The horizon, which is long enough for ten parts."""
+HORIZON: Final = 300
+"""The horizon, which is long enough for five parts in a jump."""
 
 CONSTANTS: Final[tuple[int, ...]] = (16, 18, 19, 20, 22, 26, 30)
 """The constant waiting times that are tried."""
@@ -41,7 +41,7 @@ def propose(observation: Any, *, _incumbent: Any) -> list[int]:
     """Return waiting times: all over their range at first, and then near the incumbent."""
     if not isinstance(_incumbent, int):
         return [*range(0, 60, 6)]
-    near = {_incumbent + change for change in (-12, -4, -1, 1, 4, 12)}
+    near = {_incumbent + change for change in (-30, -10, -3, -1, 1, 3, 10, 30)}
     return sorted(waiting for waiting in near if 0 <= waiting < 100)
 
 
@@ -72,7 +72,7 @@ LINES: Final = {
 
 def main(arguments: Sequence[str] | None = None) -> list[list[Any]]:
     """Measure the rules and the plan, and write the table and the figure."""
-    options = options_of("Plan production lines.", arguments, seeds=8, futures=4)
+    options = options_of("Plan production lines.", arguments, seeds=8, futures=2)
     constants = CONSTANTS
     if options.quick:
         options.seeds, options.futures, constants = 1, 1, (19,)

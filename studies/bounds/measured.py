@@ -19,6 +19,9 @@ tqdm.tqdm.monitor_interval = 0
 FIGURES: Final = Path(__file__).parents[2] / "docs" / "figures"
 """Where the figures of the pages are."""
 
+OUT: Final = Path(__file__).parent / "out"
+"""Where the results are."""
+
 PLANNED: Final = "#1b6f5f"
 """The colour of plans."""
 
@@ -32,9 +35,11 @@ def options_of(description: str, arguments: Sequence[str] | None, **counts: int)
     for name, value in counts.items():
         parser.add_argument(f"--{name}", type=int, default=value, help="(default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a run of less than half a minute")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "out")
+    parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--figures", type=Path, default=FIGURES)
     options = parser.parse_args(arguments)
+    if options.quick and options.out == OUT:
+        options.out = OUT / "quick"
     if options.quick and options.figures == FIGURES:
         options.figures = options.out
     for folder in (options.out, options.figures):
@@ -51,6 +56,23 @@ def write(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
     """Write a file of comma-separated values."""
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+
+
+def read(path: Path, numbers: Sequence[int]) -> list[list[Any]]:
+    """Return the rows of a file that ``write`` has written; none if it does not exist.
+
+    Args:
+        path: The file.
+        numbers: The columns that are numbers.
+    """
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows: list[list[Any]] = [*csv.reader(file)][1:]
+    for row in rows:
+        for column in numbers:
+            row[column] = float(row[column])
+    return rows
 
 
 def show(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

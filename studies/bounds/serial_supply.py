@@ -1,6 +1,7 @@
 """A serial supply chain of stockpyl, planned by three stages beside the exact optimum.
 
-``python -m studies.bounds.serial_supply`` runs ten episodes of 60 periods for each way to decide.
+``python -m studies.bounds.serial_supply`` runs ten episodes of 60 periods for each way to decide,
+and keeps what is finished.
 The chain is example 6.1 of Snyder and Shen, *Fundamentals of Supply Chain Theory*; its optimal
 echelon base stocks are 6.48, 12.03 and 22.72, and cost 47.665 a period in the long run. The model
 is ``examples/serial_supply``. All its random numbers are those of the demand, which branches draw
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -32,7 +34,7 @@ from stockpyl.sim import simulation
 from simenv_marl import RULE, TRUNCATED, simulate
 from simenv_marl.planning import RolloutPolicy
 
-from .measured import cpu_seconds, draw, options_of, show, write
+from .measured import cpu_seconds, draw, options_of, read, show, write
 
 FACTORS: Final = (0.9, 1.1, 1.25)
 """The candidates, in units of the incumbent."""
@@ -125,14 +127,16 @@ def main(arguments: Sequence[str] | None = None) -> list[list[Any]]:
     options = options_of("Plan a supply chain.", arguments, seeds=10, futures=4)
     if options.quick:
         options.seeds, options.futures, Chain.periods = 1, 1, 6
-    rows: list[list[Any]] = []
-    for seed in range(options.seeds):
-        for name, make in CONTENDERS.items():
+    path = options.out / "serial_supply.csv"
+    rows = [] if options.quick else read(path, (0, 2, 3))
+    for seed, (name, make) in product(range(options.seeds), CONTENDERS.items()):
+        if [seed, name] not in [row[:2] for row in rows]:
             begin = cpu_seconds()
             chain = simulate(Chain, make(futures=options.futures), seed=seed, **OPTIONS)
             cost = chain.cost / Chain.periods
             rows.append([seed, name, round(cost, 4), round(cpu_seconds() - begin, 1)])
-            write(options.out / "serial_supply.csv", ["seed", "policy", "cost", "seconds"], rows)
+            write(path, ["seed", "policy", "cost", "seconds"], rows)
+    rows = [row for row in rows if row[0] < options.seeds]
     costs = {
         name: np.array([cost for _, contender, cost, _ in rows if contender == name])
         for name in CONTENDERS

@@ -30,8 +30,9 @@ test: .venv/.test
 	$(BIN)/python -m pytest -n 2 --dist worksteal --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
 
 # One quick run of each study, from its command line to its figures, and of the benchmark.
-test-studies: .venv/.test
+test-studies: .venv/.test .venv-bounds/.bounds
 	$(BIN)/python -m pytest -n 2 $(STUDIES)
+	.venv-bounds/bin/python -m pytest tests/studies/test_bounds.py
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
 test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
@@ -85,7 +86,7 @@ test-browser: .venv-browser/.browser
 	test -x /usr/bin/chromium || (apt-get update --quiet && apt-get install --yes --quiet chromium)
 	.venv-browser/bin/python -m pytest -rs tests/seats/play/test_browser.py
 
-.venv-clients/.clients .venv-rllib/.rllib .venv-benchmarl/.benchmarl .venv-wrappers/.wrappers .venv-browser/.browser: pyproject.toml
+.venv-clients/.clients .venv-rllib/.rllib .venv-benchmarl/.benchmarl .venv-wrappers/.wrappers .venv-browser/.browser .venv-bounds/.bounds: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@

@@ -75,3 +75,13 @@ def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
     assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
     assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
     assert told.count("\n") == 2 + len(picture.STYLES)
+
+
+def test_bounds_plans_a_supply_chain(tmp_path, capsys):
+    pytest.importorskip("stockpyl")
+    from studies.bounds import serial_supply
+
+    table = serial_supply.main(["--quick", "--out", str(tmp_path)])
+    shown = capsys.readouterr().out
+    assert all(row[0] in shown for row in table)
+    assert (tmp_path / "bounds-serial-supply.png").stat().st_size > 1_000

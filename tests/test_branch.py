@@ -5,6 +5,7 @@ That branches do what the environment would have done is asserted beside the sam
 """
 
 import asyncio
+import io
 import mmap
 import multiprocessing
 import os
@@ -395,6 +396,14 @@ def a_semaphore(model):
     del semaphore
 
 
+@contextmanager
+def a_progress_bar(model):
+    bar = pytest.importorskip("tqdm").tqdm(total=9, file=io.StringIO())
+    assert bar.monitor.is_alive()
+    yield
+    bar.close()
+
+
 def held_by(model):
     """An environment of a model that decides while it holds something."""
     return begun(single_env(model, filing.choose), 4)
@@ -424,6 +433,14 @@ def test_what_cannot_be_forked_is_replayed_or_named(held, name):
     for each in (deeper, twin, env):  # to its end, or its thread stays
         found.append(filing.left(each))
     assert found == [found[0]] * 5
+
+
+def test_a_model_that_shows_a_progress_bar_is_forked(monkeypatch):
+    tqdm = pytest.importorskip("tqdm").tqdm
+    monkeypatch.setattr(tqdm, "monitor", None)  # so that this model starts it
+    env = held_by(type("Model", (Holding,), {"open": a_progress_bar}))
+    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
+    tqdm.monitor.exit()
 
 
 @pytest.mark.parametrize("held", [mapped("r"), mapped("c"), a_semaphore])

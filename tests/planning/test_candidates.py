@@ -256,7 +256,8 @@ def test_illegal_candidates_are_refused_before_anything_moves():
 def test_a_callable_proposes_candidates():
     asked = []
 
-    def propose(observation, info, *, _decision, _incumbent):
+    def propose(observation, info, *, _decision, _incumbent, _simulation):
+        assert _simulation is env.unwrapped.simulation
         asked.append((observation.tolist(), info["time"], _decision.agent, _incumbent))
         return [0, 5]
 

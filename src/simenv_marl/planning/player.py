@@ -164,6 +164,8 @@ class Player:
         asked: dict[str, object] = {}
         if asks_for(function, "_incumbent"):
             asked["_incumbent"] = incumbent
+        if asks_for(function, "_simulation"):
+            asked["_simulation"] = self.episode.simulation
         if asks_for(function, "_decision"):
             asked["_decision"] = self.agent.describe(self.episode.seed, self.episode.where)
         seen = (observation, info) if takes_info(function) else (observation,)

@@ -106,8 +106,8 @@ def action_values(
             view, one learner does, and its decisions are the steps.
         actions: The candidates: actions, policies, ``RULE``, or those of ``first``. Or a callable
             of the observation, or of the observation and the info, that returns them; it gets the
-            pending ``Decision`` as ``_decision``, if it asks. None: all legal actions of a
-            ``Discrete``.
+            pending ``Decision`` as ``_decision``, and the simulation as ``_simulation``, if it
+            asks. None: all legal actions of a ``Discrete``.
         base: The policy that decides after the candidate: ``RULE``, a callable of the observation,
             or of the observation and the info, a dict of these by agent, or the policies of
             ``turn_policy`` or ``joint_policy``. Other agents of the environment follow their entry

@@ -133,7 +133,8 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
         if isinstance(resource, socket.socket):
             held[resource.fileno()] = "a socket"
         elif isinstance(resource, Thread):
-            if resource.is_alive():
+            # A process can continue without tqdm's, which only draws bars that have stood still.
+            if resource.is_alive() and type(resource).__name__ != "TMonitor":
                 others.append("a thread")
         else:
             code = resource.returncode if isinstance(resource, Popen) else resource.exitcode

@@ -318,6 +318,7 @@ class AskingPolicy(EpisodePolicy):
         self.plans = ASKED[0] in self._call.names
         self.asks = ASKED[1] in self._call.names
         self.waits = waits(policy)
+        self._is_asked_everywhere = not (self.plans or self.waits or records(policy))
         if self.plans and self.waits:
             raise OptionValueError(
                 f"the policy {short_repr(policy)} waits, and asks for _environment, which only the"
@@ -335,7 +336,9 @@ class AskingPolicy(EpisodePolicy):
         self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
     ) -> Action | Awaitable[Action]:
         """Ask the policy, or its substitute where the episode is played."""
-        policy = policy_for(self.policy, agent.name, episode.where)
+        policy = self.policy
+        if not self._is_asked_everywhere:
+            policy = policy_for(policy, agent.name, episode.where)
         if policy is RULE:
             return RULE
         call = self._call if policy is self.policy else Caller(policy)

@@ -1,13 +1,10 @@
 """Recordings: files with a line of JSON for each answer of a policy."""
 
-import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from uuid import uuid4
@@ -17,46 +14,12 @@ from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Space, Tuple
 
 from ..core import Decision, PolicyWrapper, split_extras
 from ..errors import OptionValueError, warn_user
-from ..simulation import RULE, Action, Observation
+from ..files.lines import Lines
+from ..files.values import decode_value, digest_of, encode_value
+from ..simulation import RULE, Action
 
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 """The part of an object's text that differs from run to run."""
-
-
-# -- files ----------------------------------------------------------------------------------------
-
-
-class Lines:
-    """A file with a line of JSON for each value. It is open only while it is read or written."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Name the file. The first line creates it."""
-        self.path = Path(path)
-        self._may_be_torn = True
-
-    def read(self) -> Iterator[tuple[int, Any]]:
-        """Yield the numbers of the lines, from 1, and their values.
-
-        Lines that a crash has torn are left out.
-        """
-        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
-            with suppress(ValueError):
-                yield number, json.loads(line)
-
-    def append(self, *values: Any) -> None:
-        """Append lines, in one call, so that processes can share the file.
-
-        They begin on a new line, also where a crash or a full disk has torn the last one.
-        """
-        lines = [json.dumps(value, ensure_ascii=False) for value in values]
-        text = "".join(f"{line}\n" for line in lines).encode()
-        may_be_torn, self._may_be_torn = self._may_be_torn, True  # until all is written
-        with open(self.path, "ab+", buffering=0) as file:
-            if may_be_torn and file.tell():
-                file.seek(-1, os.SEEK_END)
-                text = text if file.read(1) == b"\n" else b"\n" + text
-            file.write(text)
-        self._may_be_torn = False
 
 
 # -- answers --------------------------------------------------------------------------------------
@@ -168,7 +131,7 @@ class Recording:
     def write(self, question: Question, outcome: Outcome, decision: Decision) -> None:
         """Append the outcome of a decision."""
         action = None if outcome.action is RULE else encode(decision.action_space, outcome.action)
-        extras = {name: _encode_part(part) for name, part in outcome.extras.items()}
+        extras = {name: encode_value(part) for name, part in outcome.extras.items()}
         outcome = replace(outcome, action=action, extras=extras)
         entry = vars(question) | vars(outcome) | {"run": self._run}
         empty = [name for name in ("policy", "extras", "why", "counts") if not entry[name]]
@@ -265,7 +228,7 @@ def _parts(entry: Mapping[str, Any], kind: type[Question | Outcome]) -> dict[str
 
 def _decoded(outcome: Outcome, space: Space[Any]) -> Outcome:
     action = outcome.action
-    extras = {name: _decode_part(part) for name, part in outcome.extras.items()}
+    extras = {name: decode_value(part) for name, part in outcome.extras.items()}
     outcome = replace(outcome, extras=extras)
     if action is None:
         return replace(outcome, action=RULE)
@@ -288,7 +251,7 @@ def encode(space: Space[Any], action: Action) -> Any:
             return space.to_jsonable([action])
     if isinstance(action, np.ndarray) and action.ndim and action.dtype == space.dtype:
         return action.tolist()
-    return _encode_part(action)
+    return encode_value(action)
 
 
 def decode(space: Space[Any], value: Any) -> Action:
@@ -300,46 +263,4 @@ def decode(space: Space[Any], value: Any) -> Action:
             return tuple(decode(*pair) for pair in zip(space.spaces, value, strict=True))
         case Sequence() | Graph() | OneOf():
             return space.from_jsonable(value)[0]
-    return np.array(value, space.dtype) if isinstance(value, list) else _decode_part(value)
-
-
-def _encode_part(part: Any) -> Any:
-    """Return an array or a number as JSON, with its dtype."""
-    match part:
-        case np.ndarray():
-            return {"array": part.tolist(), "dtype": part.dtype.str}
-        case np.generic():
-            return {"scalar": part.item(), "dtype": part.dtype.str}
-    return part
-
-
-def _decode_part(value: Any) -> Any:
-    match value:
-        case {"array": numbers, "dtype": dtype}:
-            return np.array(numbers, dtype)
-        case {"scalar": number, "dtype": dtype}:
-            return np.dtype(dtype).type(number)
-    return value
-
-
-def digest_of(observation: Observation) -> str:
-    """Return a digest of an observation: of the names, types, shapes and bytes of its parts."""
-    digest = blake2b(digest_size=12)
-
-    def add(part: Observation) -> None:
-        match part:
-            case Mapping():
-                for name in sorted(part, key=str):
-                    digest.update(str(name).encode())
-                    add(part[name])
-            case tuple() | list():
-                for item in part:
-                    add(item)
-            case np.ndarray() | np.generic() if part.dtype != object:
-                digest.update(f"{part.dtype.str}{part.shape}".encode())
-                digest.update(np.ascontiguousarray(part).tobytes())
-            case _:
-                digest.update(repr(part).encode())
-
-    add(observation)
-    return digest.hexdigest()
+    return np.array(value, space.dtype) if isinstance(value, list) else decode_value(value)

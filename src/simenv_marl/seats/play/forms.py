@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ...core import Decision, Labels, Mask
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
+from ...files.values import digest_of
 from ...simulation import RULE, Action, Observation
 from ..answers import MISFITS, to_action
 from ..descriptions import JSON, labelled, legal_actions, situation
-from ..recordings import digest_of
 
 Message = dict[str, Any]
 """A message between the page, the server and the game, or a part of one."""

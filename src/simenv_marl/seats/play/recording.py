@@ -14,9 +14,10 @@ from ...errors import (
     UnknownPointError,
     short_repr,
 )
+from ...files.lines import Lines
+from ...files.values import digest_of
 from ...simulation import Action, Model, Observation
 from ..descriptions import JSON
-from ..recordings import Lines, digest_of
 from .forms import Message, action_of, jsonable
 
 

@@ -196,12 +196,35 @@ def load_episode(
     return _Loading(Path(path)).load(simulation, points, options)
 
 
+def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> str:
+    """Repeat an episode, and return its timeline as text.
+
+    Args:
+        path: The file.
+        until: The number of decisions to repeat; those of policies that follow are repeated, too.
+            None: all.
+
+    Raises:
+        SimEnvError: Any error of ``load_episode``.
+    """
+    timeline: list[str] = []
+    loading = _Loading(Path(path), timeline)
+    if until is not None:
+        loading.stop_at(until)
+    view = loading.load(None, None, {})
+    head = f"{view.session.plan.name}, view {view.kind}, seed {view.session.seed}"
+    timeline.append(f"now: {_shown(end_of(view.episode))}")
+    view.close()
+    return "\n".join((head, *timeline))
+
+
 class _Loading:
     """A file that is being loaded."""
 
-    def __init__(self, path: Path) -> None:
-        """Read a file."""
+    def __init__(self, path: Path, timeline: list[str] | None = None) -> None:
+        """Read a file. ``timeline`` gets a text for each repeated decision."""
         self._path = path
+        self._timeline = timeline
         try:
             lines = [*Lines(path).read()]
         except OSError as error:
@@ -212,23 +235,23 @@ class _Loading:
         self._answers: list[Action] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
         for number, (place, line) in enumerate(lines, 1):
-            is_last = number == len(lines)
             try:
-                if place != number or not isinstance(line, dict) or self._last:
+                if place != number or (self._last and "exit" not in line):
                     raise ValueError
                 if number == 1:
-                    self._head = dict(line)
-                    self._head["reset"] = decode_value(line.get("reset"))
+                    self._head = line | {"reset": decode_value(line.get("reset"))}
+                    self._view = VIEWS[line["view"]]
+                    if line["episode"] != FORMAT or not isinstance(line["versions"], dict):
+                        raise ValueError
                 elif line.keys() & {"action", "exit", "reseed"}:
                     self._add(number, line)
-                elif is_last and line.keys() & {"agent", "end", "error"}:
+                elif line.keys() & {"agent", "end", "error"}:
                     self._last = line
                 else:
                     raise ValueError
             except Exception as error:
                 raise self._malformed(place) from error
-        head = getattr(self, "_head", {})
-        if head.get("view") not in VIEWS or head.get("episode") != FORMAT:
+        if not lines:
             raise self._malformed(1)
         if "error" in self._last:
             self._cut()
@@ -250,15 +273,24 @@ class _Loading:
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
-        places = [
+        self._last = {}
+        self.stop_at(max(self._places(), default=len(self._answers)))
+
+    def _places(self) -> list[int]:
+        """Return the places of the user's answers."""
+        return [
             place
-            for place, (_, line) in enumerate(self._expected)
+            for place, (_, line) in enumerate(islice(self._expected, len(self._answers)))
             if "agent" in line and "by" not in line
         ]
-        self._last = {}
-        if places:
-            self._last = self._expected[places[-1]][1]
-            del self._answers[places[-1] :]
+
+    def stop_at(self, least: int) -> None:
+        """Leave out the user's next answer after so many answers, and whatever follows it."""
+        for place in self._places():
+            if place >= least:
+                self._last = self._expected[place][1]
+                del self._answers[place:]
+                return
 
     def load(self, simulation: Model, points: Points, options: ViewOptions) -> Any:
         """Make the environment."""
@@ -269,7 +301,7 @@ class _Loading:
                 raise
             raise self._malformed(1) from error
         plan = plan_of(*arguments)
-        view = VIEWS[self._head["view"]](plan)
+        view = self._view(plan)
         try:
             problem = self._replay(view)
             if problem is not None:  # the process was killed before it could write that
@@ -296,6 +328,14 @@ class _Loading:
                 number, recorded = expected.popleft()
                 if recorded != line:
                     raise self._difference(plan, number, recorded, line)
+                if self._timeline is not None and "agent" in line:
+                    agent = session.episode.latest
+                    time = "" if agent.now is None else f"  at {agent.now:g}"
+                    by = ", by its policy" if "by" in line else ""
+                    action = short_repr(self._answers[answers - len(expected) - 1], 60)
+                    self._timeline.append(
+                        f"{len(self._timeline) + 1:6}{time}  {agent.name}: {action}{by}"
+                    )
 
         def make(session: Session) -> FileTape:
             tape = make_tape(session)

@@ -306,7 +306,7 @@ def test_the_first_decision_that_differs_is_named(number, change, problem, tmp_p
 
 def test_other_versions_are_named_as_the_reason(tmp_path):
     save_episode(begun(), tmp_path / "a")
-    changed(tmp_path / "a", 0, lambda line: line["packages"].update(numpy="1.0", lost="2.0"))
+    changed(tmp_path / "a", 0, lambda line: line["versions"].update(numpy="1.0", lost="2.0"))
     changed(tmp_path / "a", 3, lambda line: line.update(seen=""))
     with pytest.raises(EpisodeFileError, match=r"numpy was 1\.0, and is .*; lost was 2\.0, and is"):
         load_episode(tmp_path / "a")

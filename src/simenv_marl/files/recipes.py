@@ -109,11 +109,8 @@ def recipe_of(plan: Plan, unnamed: bool = False) -> Json:
             " give them to load_episode"
         )
     about = describe(plan, None)
-    return recipe | {
-        "python": about["python"],
-        "machine": platform.machine(),
-        "packages": about["packages"] | about["dependencies"],
-    }
+    versions = {"python": about["python"], "machine": platform.machine()}
+    return recipe | {"versions": versions | about["packages"] | about["dependencies"]}
 
 
 def _portable(value: Any) -> Any:
@@ -168,6 +165,8 @@ def arguments_of(
     for name, value in recipe["options"].items():
         if name in given:
             continue
+        if name.startswith("record"):
+            raise KeyError(name)
         given[name] = read(value)
         if name == "plugins":
             given[name] = [(handler, _checked(target), at) for handler, target, at in given[name]]
@@ -200,11 +199,9 @@ def changes_since(recipe: Json, plan: Plan) -> list[str]:
         for entry, other in zip(recipe["points"], now["points"], strict=False)
         if entry["spaces"] != other["spaces"]
     ]
-    versions = {"python": recipe["python"], "machine": recipe["machine"], **recipe["packages"]}
-    here = {"python": now["python"], "machine": now["machine"], **now["packages"]}
-    changes += [
+    here = now["versions"]
+    return changes + [
         f"{name} was {version}, and is {here.get(name)}"
-        for name, version in versions.items()
+        for name, version in recipe["versions"].items()
         if here.get(name) != version
     ]
-    return changes

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable
 from functools import partial
+from json.encoder import c_make_encoder, encode_basestring  # type: ignore[attr-defined]
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 from weakref import ref
 
-from ..core import Action, Agent, EpisodeState, Plan, Reseeded, Session, Tape, Where
-from ..errors import describe_error
+from ..core import Action, Agent, EpisodeState, Plan, Reseeded, Session, Tape
+from ..errors import StoreError, describe_error
 from .recipes import FORMAT, Json, recipe_of
 from .values import digest_of, encode_value
 
 Put = Callable[[Json], object]
 """Gets a line of a file."""
 
-to_text = json.JSONEncoder(ensure_ascii=False).encode
-"""Returns the JSON of a value, faster than ``json.dumps``."""
+# ``JSONEncoder.encode`` makes it for each line, which takes twice the time.
+_chunks: Any = c_make_encoder(None, None, encode_basestring, None, ": ", ", ", False, False, True)
+
+
+def to_text(line: Json) -> str:
+    """Return a line of a file."""
+    return "".join(_chunks(line, 0))
 
 
 def decision_of(episode: EpisodeState, agent: Agent) -> Json:
@@ -31,13 +36,15 @@ def decision_of(episode: EpisodeState, agent: Agent) -> Json:
     """
     if not episode.in_rounds or agent.delegated:
         line: Json = {"agent": agent.name, "seen": digest_of(agent.observation)}
-        return line if agent.mask is None else line | {"mask": digest_of(agent.mask)}
-    agents = episode.agents
+        if agent.mask is not None:
+            line["mask"] = digest_of(agent.mask)
+        return line
+    agents = episode.agents.items()
     line = {
         "agent": agent.name,
-        "seen": {name: digest_of(agents[name].observation) for name in agents},
+        "seen": {name: digest_of(each.observation) for name, each in agents},
     }
-    masks = {name: digest_of(each.mask) for name, each in agents.items() if each.mask is not None}
+    masks = {name: digest_of(each.mask) for name, each in agents if each.mask is not None}
     return line | {"mask": masks} if masks else line
 
 
@@ -53,49 +60,48 @@ class FileTape(Tape):
 
     __slots__ = ("_compare", "_put", "_session")
 
-    def __init__(
-        self, session: Session, put: Put | None = None, compare: Put | None = None
-    ) -> None:
-        """Make the tape of a session's next episode.
-
-        Args:
-            session: The session.
-            put: Gets each line.
-            compare: Gets each line before that, without the action.
-        """
+    def __init__(self, session: Session, put: Put | None = None) -> None:
+        """Make the tape of a session's next episode. ``put`` gets each line."""
         self._session = ref(session)
         self._put = put
-        self._compare = compare
+        self._compare: Put | None = None
 
     def compare(self, compare: Put | None) -> None:
-        """Pass lines on to another function. None: to none."""
+        """Pass each line on to another function, too, without the action. None: no more."""
         self._compare = compare
+
+    def _episode(self) -> Any:
+        """Return the episode. None in a fork, which must not write for its parent."""
+        session = self._session()
+        return None if session is None or session.where else session.episode
 
     def append(self, answer: Action) -> None:
         """Add an answer to the decision of the agent that decided last."""
         super().append(answer)
-        session = self._session()
-        if (self._put or self._compare) is None or session is None:
+        if self._put is None and self._compare is None:
             return
-        episode = session.episode
+        episode = self._episode()
+        if episode is None:
+            return
         if type(answer) is Reseeded:
             self._pass_on({"reseed": answer.seed})
-        elif episode is not None and episode.latest is not None:
-            line = decision_of(episode, episode.latest)
-            if episode.latest.delegated:
-                line["by"] = "policy"
-            self._pass_on(line, answer)
+            return
+        line = decision_of(episode, episode.latest)
+        if episode.latest.delegated:
+            line["by"] = "policy"
+        self._pass_on(line, "action", answer)
 
     def note_exit(self, agent: str) -> None:
         """Add the ``None`` step of an agent that has ended."""
-        self._pass_on({"exit": agent})
+        if self._episode() is not None:
+            self._pass_on({"exit": agent})
 
-    def _pass_on(self, line: Json, answer: Action = None) -> None:
+    def _pass_on(self, line: Json, key: str = "", answer: Action = None) -> None:
         if self._compare is not None:
             self._compare(line)
         if self._put is not None:
-            if "agent" in line:
-                line["action"] = encode_value(answer)
+            if key:
+                line[key] = answer if type(answer) is int else encode_value(answer)
             self._put(line)
 
 
@@ -109,9 +115,12 @@ def recorder(plan: Plan, view: str) -> Callable[[Session], FileTape]:
         EpisodeFileError: The environment has parts that have no name.
         StoreError: The folder cannot be made.
     """
+    folder = Path(plan.options.record or "").absolute()
     recipe = plan.derive(recipe_of)
-    folder = Path(plan.options.record or "")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{folder} cannot be made: {describe_error(error)}") from error
     return partial(Recorder, folder, recipe, view)
 
 
@@ -128,39 +137,38 @@ class Recorder(FileTape):
         path: The file.
     """
 
-    __slots__ = ("_has_ended", "_keeps", "path")
+    __slots__ = ("_keeps", "path")
 
     def __init__(self, folder: Path, recipe: Json, view: str, session: Session) -> None:
         """Begin the file of a session's next episode."""
-        super().__init__(session, self._write)
         seed = session.seed or 0
-        name = f"{time.strftime('%Y%m%d-%H%M%S')}-{seed}-{uuid4().hex[:8]}.jsonl"
-        self.path = (folder / name).absolute()
-        self._keeps = session.plan.options.record_all
-        self._has_ended = False
-        self._write(head_of(recipe, view, seed, session.options))
-
-    def _write(self, line: Json) -> None:
-        """Append a line, unless this is a fork, whose episode is another one."""
-        session = self._session()
-        if session is None or session.where is not Where.USER or self._has_ended:
-            return
-        file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            os.write(file, f"{to_text(line)}\n".encode(errors="surrogatepass"))
-        finally:
-            os.close(file)
+        self.path = folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{seed}-{uuid4().hex[:8]}.jsonl"
+        super().__init__(session, partial(_append, str(self.path)))
+        self._keeps: bool | None = session.plan.options.record_all  # None: its end is written
+        _append(str(self.path), head_of(recipe, view, seed, session.options))
 
     def end(self, error: BaseException | None = None) -> str:
         """Finish the file after an error, or if all are kept. Else remove it."""
-        session = self._session()
-        if self._has_ended or session is None or session.where is not Where.USER:
+        episode = self._episode()
+        if self._put is None or episode is None:
             return ""
         if error is not None:
-            self._write({"error": describe_error(error)})
-        elif self._keeps and session.episode is not None:
-            self._write(end_of(session.episode))
-        else:
+            self._put({"error": describe_error(error)})
+            self._put = None
+            return f"; the episode is in {self.path}"
+        if self._keeps:
+            self._put(end_of(episode))
+            self._keeps = None  # the steps of ended agents follow
+        elif self._keeps is False:
+            self._put = None
             self.path.unlink(missing_ok=True)
-        self._has_ended = True
-        return "" if error is None else f"; the episode is in {self.path}"
+        return ""
+
+
+def _append(path: str, line: Json) -> None:
+    """Append a line to a file."""
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.write(file, f"{to_text(line)}\n".encode(errors="surrogatepass"))
+    finally:
+        os.close(file)

@@ -28,6 +28,7 @@ from simenv_marl.errors import (
     StoreError,
     ViewError,
 )
+from simenv_marl.planning import RolloutPolicy
 from tests.processes import python
 from tests.worlds import saved
 from tests.worlds.random_worlds import POINTS, outcome
@@ -402,8 +403,11 @@ def test_all_files_stay_if_all_are_wanted(tmp_path):
     env.close()
     paths = sorted(tmp_path.iterdir(), key=lambda path: lines_of(path)[0]["seed"])
     ends = [line for path in paths for line in lines_of(path) if "end" in line]
-    assert ends == [{"end": "terminated"}] * 2 + [{"end": "stopped"}]
-    assert load_episode(paths[0]).unwrapped.session.episode.terminated
+    assert ends == [{"end": "terminated"}] * 2
+    assert [line.get("exit") for line in lines_of(paths[0])[-2:]] == ["push", "pull"]
+    loaded = load_episode(paths[0])
+    assert (loaded.agents, loaded.unwrapped.session.episode.terminated) == ([], True)
+    assert load_episode(paths[2]).agents == ["push", "pull"]
 
 
 def test_clones_and_branches_do_not_write_into_the_file(tmp_path):
@@ -467,3 +471,13 @@ def test_a_kill_in_the_model_loads_before_an_answer_that_fails(tmp_path):
     os.truncate(path, path.read_bytes().rstrip().rfind(b"\n") + 1)  # without the error
     with pytest.raises(ArithmeticError, match="burst"):
         load_episode(path).step(RULE)
+
+
+@pytest.mark.filterwarnings("ignore:yard cannot draw")
+def test_a_planner_branches_its_first_decision_and_is_saved(tmp_path):
+    env = begun(policies={"planner": PLANNER}, taken=2)
+    save_episode(env, tmp_path / "a")
+    assert future(load_episode(tmp_path / "a"), 3) == future(env, 3)
+
+
+PLANNER = RolloutPolicy([1, 2], futures=1, horizon=1, method="replay")

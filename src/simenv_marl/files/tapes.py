@@ -156,7 +156,7 @@ class Recorder(FileTape):
             self._put({"error": describe_error(error)})
             self._put = None
             return f"; the episode is in {self.path}"
-        if self._keeps:
+        if self._keeps and (episode.terminated or episode.truncated):
             self._put(end_of(episode))
             self._keeps = None  # the steps of ended agents follow
         elif self._keeps is False:

@@ -172,7 +172,8 @@ class Session(BaseSession):
                 self._warn_of_outdated()
                 self.options = options
                 self.seed = self.seed_for(seed)
-                replay, self._replay = replay or self._replay, None
+                if replay is None:
+                    replay, self._replay = self._replay, None
                 more: list[int] | None = None
                 while True:
                     self._driver = self._driver.ready()

@@ -269,13 +269,13 @@ def move(env, chance):
     return repr(results), results[2] or results[3]
 
 
-def future(env, seed):
-    """Return all that comes of an environment that a seed's answers continue."""
+def future(env, seed, most=10_000):
+    """Return all that comes of an environment that a seed's answers continue, up to a length."""
     chance = random.Random(seed)
     view = env.unwrapped
     found = [repr(view.latest) if view.kind != "aec" or env.agents else "over"]
     over = not env.agents if hasattr(env, "agents") else view.session.episode.over
-    while not over:
+    while not over and len(found) < most:
         told, over = move(env, chance)
         found.append(told)
     return found

@@ -39,7 +39,7 @@ class _Writer:
         """Return a part of the recipe as JSON."""
 
         def other(thing: Any) -> Any:
-            name = self.names.get(id(thing)) or names_of([thing]).get(id(thing))
+            name = None if isinstance(thing, Definition) else names_of([thing]).get(id(thing))
             if name is not None:
                 return {"name": name}
             if isinstance(thing, partial):

@@ -85,13 +85,15 @@ def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = Fals
         )
     session = view.session
     recording = session.recording()
+    if view.episode.pending is None and not view.episode.over:
+        raise session.refusal()
     lines = [
         head_of(recipe_of(session.plan, unnamed), view.kind, recording.seed, recording.options)
     ]
     file = getattr(getattr(session.episode, "tape", None), "path", None)
     if file is not None and file.exists():  # with ``record=``
         lines += [line for number, line in Lines(file).read() if number > 1]
-        if lines[-1].keys().isdisjoint(("end", "error")):
+        if all(line.keys().isdisjoint(("end", "error")) for line in lines):
             lines.append(end_of(view.episode))
     else:
         lines += _repeated(view, recording)

@@ -25,6 +25,7 @@ from simenv_marl.errors import (
     EpisodeFileError,
     NotResetError,
     OptionValueError,
+    ReentrancyError,
     StoreError,
     ViewError,
 )
@@ -481,3 +482,51 @@ def test_a_planner_branches_its_first_decision_and_is_saved(tmp_path):
 
 
 PLANNER = RolloutPolicy([1, 2], futures=1, horizon=1, method="replay")
+
+
+@pytest.mark.filterwarnings("ignore:yard cannot draw")
+def test_planners_do_not_change_the_files_of_the_next_episodes(tmp_path):
+    env = begun(policies={"planner": PLANNER}, taken=2, record=tmp_path)
+    env.reset(seed=2)
+    env.step(RULE)
+    [path] = tmp_path.iterdir()
+    assert repr(load_episode(path).last()) == repr(env.last())
+
+
+def test_points_in_another_order_than_the_simulations_keep_it(tmp_path):
+    env = turn_env(Pumps, list(Pumps.points)[::-1])
+    observation, _ = env.reset(seed=1)
+    save_episode(env, tmp_path / "a")
+    assert repr(load_episode(tmp_path / "a").latest[0]) == repr(observation)
+
+
+def test_an_environment_that_moves_is_not_saved(tmp_path):
+    found = []
+
+    def use(observation):
+        with pytest.raises(ReentrancyError):
+            save_episode(env, tmp_path / "a")
+        found.append(1)
+        return 1
+
+    env = aec_env(YARD, POINTS, policies={"planner": use})
+    env.reset(seed=1)
+    assert found
+
+
+def test_all_kept_files_are_saved_again(tmp_path):
+    env = aec_env(Pumps, record=tmp_path / "all", record_all=True, max_steps=2)
+    env.reset(seed=1)
+    while env.agents:
+        env.step(None if env.truncations[env.agent_selection] else RULE)
+    save_episode(env, tmp_path / "a")
+    loaded = load_episode(tmp_path / "a", record=None)
+    assert (loaded.agents, loaded.unwrapped.episode.truncated) == ([], True)
+
+
+def test_a_loaded_episode_is_recorded_again(tmp_path):
+    save_episode(begun(), tmp_path / "a")
+    loaded = load_episode(tmp_path / "a", record=tmp_path / "b")
+    loaded.step(RULE)
+    [path] = (tmp_path / "b").iterdir()
+    assert repr(load_episode(path).last()) == repr(loaded.last())

@@ -127,7 +127,7 @@ class View:
         self.session = session
         self._lock = session.lock
         self._finalizer = weakref.finalize(self, session.abandon) if owned else None
-        if plan.options.record is not None and isinstance(session, Session):
+        if plan.options.record is not None and self.kind and isinstance(session, Session):
             session.make_tapes(recorder(plan, self.kind))
         self._roster = plan.roster  # the decision points of the agents that are known beforehand
         if attributes:  # because ``vars`` makes the attributes of an object slower

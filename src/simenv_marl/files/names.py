@@ -111,8 +111,7 @@ def _is_of(thing: object, module: ModuleType) -> bool:
 
 def definition_at(name: str, point: str) -> Definition | None:
     """Return the definition with a dotted name, or that of a decision point in a dict."""
-    thing = find(name)
+    thing = find(name) if name else None
     if isinstance(thing, Mapping):
-        keys = [key for key in thing if point in (key, portable(key))]
-        thing = thing[keys[0]] if keys else None
+        thing = next((part for key, part in thing.items() if point in (key, portable(key))), None)
     return thing if isinstance(thing, Definition) else None

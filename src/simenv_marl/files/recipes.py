@@ -28,11 +28,9 @@ class _Writer:
     """Replaces objects by their names.
 
     Attributes:
-        names: The names of objects, by ``id``.
         unnamed: The objects without a name, by the part of the recipe.
     """
 
-    names: dict[int, str]
     unnamed: dict[str, object]
 
     def write(self, place: str, value: object) -> Any:
@@ -63,17 +61,16 @@ def recipe_of(plan: Plan, unnamed: bool = False) -> Json:
         EpisodeFileError: Something has no name.
     """
     subject = plan.subject
-    writer = _Writer(names_of([*subject.given.values()]), {})
+    given = subject.given
+    is_own = [*given.items()] == [*subject.own.items()]  # the simulation names them
+    writer = _Writer({})
+    names = names_of([*given.values()])
     points: list[Json] = []
-    for hook, definition in subject.given.items():
+    for hook, definition in given.items():
         name = None
-        try:
-            is_own = find_point(hook.name, own=subject.own)[1] is definition
-        except SimEnvError:  # the function itself has no definition
-            is_own = False
-        if not is_own:
-            name = writer.names.get(id(definition), "")
-            if not name or definition_at(name, hook.name) is not definition:
+        if not is_own and (is_refused(hook.name) or not _is_at(hook.name, definition, plan)):
+            name = names.get(id(definition), "")
+            if is_refused(hook.name) or definition_at(name, hook.name) is not definition:
                 writer.unnamed[f"the definition of {hook.name}"], name = definition, ""
         spaces = f"{definition.observation_space} {definition.action_space}"
         points.append({"point": hook.name, "definition": name, "spaces": digest_of(spaces)})
@@ -95,11 +92,10 @@ def recipe_of(plan: Plan, unnamed: bool = False) -> Json:
         ]
     recipe = {
         "simulation": writer.write("the simulation", subject.source),
+        "own": is_own,
         "points": points,
         "options": options,
     }
-    if subject.given == subject.own:
-        recipe["own"] = True  # the simulation's attribute ``points`` names them
     if writer.unnamed and not unnamed:
         places = [f"{place}: {short_repr(thing)}" for place, thing in writer.unnamed.items()]
         raise EpisodeFileError(
@@ -111,6 +107,14 @@ def recipe_of(plan: Plan, unnamed: bool = False) -> Json:
     about = describe(plan, None)
     versions = {"python": about["python"], "machine": platform.machine()}
     return recipe | {"versions": versions | about["packages"] | about["dependencies"]}
+
+
+def _is_at(point: str, definition: Definition, plan: Plan) -> bool:
+    """Return whether a function has a definition itself."""
+    try:
+        return find_point(point, own=plan.subject.own)[1] is definition
+    except SimEnvError:
+        return False
 
 
 def _portable(value: Any) -> Any:
@@ -159,7 +163,7 @@ def arguments_of(
     read: Callable[[Any], Any] = partial(decode_value, other=other)
     if simulation is None:
         simulation = read(recipe["simulation"])
-    if points is None and not recipe.get("own"):
+    if points is None and not recipe["own"]:
         points = {entry["point"]: _definition_of(**entry) for entry in recipe["points"]}
     given = dict(options)
     for name, value in recipe["options"].items():
@@ -182,7 +186,7 @@ def _definition_of(point: str, definition: str | None, **_: str) -> Definition |
     _checked(point)
     if definition is None:
         return None
-    found = definition_at(definition, point) if definition else None
+    found = definition_at(definition, point)
     if found is None:
         where = f"is no longer at {definition}" if definition else "has no name"
         raise EpisodeFileError(

@@ -18,7 +18,6 @@ import os
 from collections import deque
 from contextlib import suppress
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Unpack
 from uuid import uuid4
@@ -233,28 +232,23 @@ class _Loading:
             raise StoreError(f"{path} cannot be read: {describe_error(error)}") from error
         except RecursionError:
             raise self._malformed(1) from None
-        self._expected: deque[tuple[int, Json]] = deque()
+        self._lines: list[Json] = []  # those of answers, without the actions
         self._answers: list[Action] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
-        for number, (place, line) in enumerate(lines, 1):
-            try:
-                if place != number or (self._last and "exit" not in line):
-                    raise ValueError
+        number = 0
+        try:
+            for number, (place, line) in enumerate(lines, 1):
                 if number == 1:
                     self._head = line | {"reset": decode_value(line.get("reset"))}
                     self._view = VIEWS[line["view"]]
-                    if line["episode"] != FORMAT or not isinstance(line["versions"], dict):
-                        raise ValueError
-                elif line.keys() & {"action", "exit", "reseed"}:
-                    self._add(number, line)
-                elif line.keys() & {"agent", "end", "error"}:
-                    self._last = line
                 else:
-                    raise ValueError
-            except Exception as error:
-                raise self._malformed(place) from error
-        if not lines:
-            raise self._malformed(1)
+                    self._take(line)
+                if place != number:
+                    raise ValueError("there is a torn line before it")
+            if self._head["episode"] != FORMAT or not isinstance(self._head["versions"], dict):
+                raise ValueError("it is of another version")
+        except Exception as error:
+            raise self._malformed(number) from error
         if "error" in self._last:
             self._cut()
 
@@ -263,14 +257,20 @@ class _Loading:
             f"line {number} of {self._path} is not what save_episode of this version writes"
         )
 
-    def _add(self, number: int, line: Json) -> None:
-        """Add the line of an answer."""
+    def _take(self, line: Json) -> None:
+        """Take a line after the first one."""
         if "reseed" in line:
             answer: Action = Reseeded(line["reseed"])
+        elif "exit" in line:
+            answer = _EXIT
+        elif "action" in line and not self._last:
+            answer = decode_value(line.pop("action"))
+        elif line.keys() & {"agent", "end", "error"} and not self._last:
+            self._last = line
+            return
         else:
-            answer = _EXIT if "exit" in line else decode_value(line["action"])
-        line.pop("action", None)
-        self._expected.append((number, line))
+            raise ValueError("it is no line of an answer")
+        self._lines.append(line)
         self._answers.append(answer)
 
     def _cut(self) -> None:
@@ -280,17 +280,14 @@ class _Loading:
 
     def _places(self) -> list[int]:
         """Return the places of the user's answers."""
-        return [
-            place
-            for place, (_, line) in enumerate(islice(self._expected, len(self._answers)))
-            if "agent" in line and "by" not in line
-        ]
+        lines = enumerate(self._lines[: len(self._answers)])
+        return [place for place, line in lines if "agent" in line and "by" not in line]
 
     def stop_at(self, least: int) -> None:
         """Leave out the user's next answer after so many answers, and whatever follows it."""
         for place in self._places():
             if place >= least:
-                self._last = self._expected[place][1]
+                self._last = self._lines[place]
                 del self._answers[place:]
                 return
 
@@ -322,22 +319,24 @@ class _Loading:
         plan = session.plan
         is_recorded = plan.options.record is not None
         make_tape = recorder(plan, view.kind) if is_recorded else FileTape
-        answers = len(self._answers)
-        expected = deque(islice(self._expected, answers))
+        expected = deque(self._lines[: len(self._answers)])
+
+        def differ(recorded: Json, line: Json) -> EpisodeFileError:
+            number = 2 + len(self._answers) - len(expected)
+            return self._difference(plan, number, recorded, line)
 
         def compare(line: Json) -> None:
+            if expected and expected[0] != line:
+                raise differ(expected[0], line)
+            if expected and self._timeline is not None and "agent" in line:
+                agent = session.episode.latest
+                time = "" if agent.now is None else f"  at {agent.now:g}"
+                action = short_repr(self._answers[-len(expected)], 60)
+                by = ", by its policy" if "by" in line else ""
+                number = len(self._timeline) + 1
+                self._timeline.append(f"{number:6}{time}  {agent.name}: {action}{by}")
             if expected:
-                number, recorded = expected.popleft()
-                if recorded != line:
-                    raise self._difference(plan, number, recorded, line)
-                if self._timeline is not None and "agent" in line:
-                    agent = session.episode.latest
-                    time = "" if agent.now is None else f"  at {agent.now:g}"
-                    by = ", by its policy" if "by" in line else ""
-                    action = short_repr(self._answers[answers - len(expected) - 1], 60)
-                    self._timeline.append(
-                        f"{len(self._timeline) + 1:6}{time}  {agent.name}: {action}{by}"
-                    )
+                expected.popleft()
 
         def make(session: Session) -> FileTape:
             tape = make_tape(session)
@@ -353,46 +352,35 @@ class _Loading:
         except Exception as error:
             if not self._last and (not replay or replay[0] is GO_ON):
                 return error
-            number, recorded = expected[0] if expected else (answers + 2, self._last)
-            episode = session.episode
-            line = {"error": describe_error(error)}
-            if episode is not None:
-                line = end_of(episode) | line
-            raise self._difference(plan, number, recorded, line) from error
+            recorded = expected[0] if expected else self._last
+            raise differ(recorded, {"error": describe_error(error)}) from error
         finally:
             session.make_tapes(make_tape if is_recorded else None)
         view.episode.tape.compare(None)
         line = end_of(view.episode)
         if self._last and line != self._last:
-            raise self._difference(plan, answers + 2, self._last, line)
+            raise differ(self._last, line)
         return None
 
     def _difference(self, plan: Plan, number: int, recorded: Json, line: Json) -> EpisodeFileError:
         """Make the error for a line of the file, and the line that the environment has there."""
-        parts = []
-        if recorded.get("agent") != line.get("agent"):
-            parts.append(f"it was {_shown(recorded)}, and is {_shown(line)}")
-        elif recorded.get("seen") != line.get("seen"):
-            parts.append(f"the observation of {_shown(recorded)} differs")
-        elif recorded.get("mask") != line.get("mask"):
-            parts.append(f"the legal actions of {_shown(recorded)} differ")
-        else:
-            parts.append(f"it was {to_text(recorded)}, and is {to_text(line)}")
-        if "error" in line and "agent" in line:  # the answer was refused
-            parts.append(line["error"])
-        changes = changes_since(self._head, plan)
-        reason = "; ".join(changes) or (
+        problem = f"it was {_shown(recorded)}, and is {_shown(line)}"
+        if _shown(recorded) == _shown(line):
+            names = {"seen": "the observation", "mask": "the mask of legal actions"}
+            differing = [text for key, text in names.items() if recorded.get(key) != line.get(key)]
+            problem = f"{' and '.join(differing) or 'the answerer'} of {_shown(line)} differs"
+        reasons = changes_since(self._head, plan) or [
             "has the model changed? It may also iterate over a set of strings, draw from a global"
             " generator (global_rng=True), or have been recorded with other floats of another"
             " machine"
-        )
+        ]
         return EpisodeFileError(
-            f"{self._path}, line {number}: the simulation does not repeat this decision:"
-            f" {', '.join(parts)}. Likely reasons: {reason}"
+            f"{self._path}, line {number}: the simulation does not repeat this decision: {problem}."
+            f" Likely reasons: {'; '.join(reasons)}"
         )
 
 
 def _shown(line: Json) -> str:
-    """Return a line of a decision or of an end as words."""
-    agent = line.get("agent")
-    return to_text(line) if agent is None else f"a decision of {agent!r}"
+    """Return a line of a decision, an end or an error as words."""
+    decision = f"a decision of {line['agent']!r}" if "agent" in line else ""
+    return line.get("error") or decision or to_text(line)

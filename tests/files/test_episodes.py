@@ -291,11 +291,11 @@ def changed(path, number, change):
     [
         (3, {"seen": "0" * 24}, r"line 4.*the observation of a decision of .* differs"),
         (2, {"agent": "nobody"}, r"line 3.*it was a decision of 'nobody', and is a decision of"),
-        (4, {"mask": "1" * 24}, r"line 5.*the legal actions of a decision of .* differ"),
+        (4, {"mask": "1" * 24}, r"line 5.*the mask of legal actions of a decision of .* differs"),
         (5, {"action": 99}, r"line 6.*InvalidActionError"),
         (7, {"seen": "0" * 24}, r"line 8.*the observation"),
         (0, {"seed": 8}, r"line 2.*the observation"),
-        (7, {"action": 3, "agent": "planner", "by": "policy"}, r"line 8: .*it was"),
+        (7, {"action": 3, "agent": "planner", "by": "policy"}, r"line 8: .*the answerer of a decision of"),
     ],
 )
 def test_the_first_decision_that_differs_is_named(number, change, problem, tmp_path):
@@ -317,7 +317,7 @@ def test_other_versions_are_named_as_the_reason(tmp_path):
 def test_an_episode_that_ends_earlier_is_a_difference(tmp_path):
     env = begun(single_env, Pumps, points=None, agent="push", taken=12)
     save_episode(env, tmp_path / "a")
-    with pytest.raises(EpisodeFileError, match=r"line 5.*end.*truncated"):
+    with pytest.raises(EpisodeFileError, match=r"line 5.*the episode is over"):
         load_episode(tmp_path / "a", max_steps=3)
 
 

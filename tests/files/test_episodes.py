@@ -295,7 +295,11 @@ def changed(path, number, change):
         (5, {"action": 99}, r"line 6.*InvalidActionError"),
         (7, {"seen": "0" * 24}, r"line 8.*the observation"),
         (0, {"seed": 8}, r"line 2.*the observation"),
-        (7, {"action": 3, "agent": "planner", "by": "policy"}, r"line 8: .*the answerer of a decision of"),
+        (
+            7,
+            {"action": 3, "agent": "planner", "by": "policy"},
+            r"line 8: .*the answerer of a decision of",
+        ),
     ],
 )
 def test_the_first_decision_that_differs_is_named(number, change, problem, tmp_path):

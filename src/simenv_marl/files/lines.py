@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,11 @@ class Lines:
         Lines that a crash has torn are left out.
         """
         for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
-            with suppress(ValueError):
-                yield number, json.loads(line)
+            try:
+                value = json.loads(line.decode(errors="surrogatepass"))
+            except ValueError:
+                continue
+            yield number, value
 
     def append(self, *values: Any) -> None:
         """Append lines, in one call, so that processes can share the file.

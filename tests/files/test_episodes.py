@@ -534,3 +534,23 @@ def test_a_loaded_episode_is_recorded_again(tmp_path):
     loaded.step(RULE)
     [path] = (tmp_path / "b").iterdir()
     assert repr(load_episode(path).last()) == repr(loaded.last())
+
+
+class Rare(Pumps):
+    """Pumps that do not push in every episode."""
+
+    points = Pumps.points
+
+    def run(self):
+        if self.random.random() < 0.3:
+            super().run()
+
+
+def test_seeds_without_a_decision_leave_no_file(tmp_path):
+    env = single_env(Rare, agent="push", record=tmp_path, record_all=True)
+    env.reset(seed=0)
+    env.reset(seed=2)
+    env.close()
+    assert len(list(tmp_path.iterdir())) == 2
+    for path in tmp_path.iterdir():
+        assert load_episode(path).unwrapped.own_agent.name == "push"

@@ -156,14 +156,14 @@ class Recorder(FileTape):
         episode = self._episode()
         if self._put is None or episode is None:
             return ""
-        if error is not None:
+        if error is not None and self._keeps is not None:
             self._put({"error": describe_error(error)})
             self._put = None
             return f"; the episode is in {self.path}"
-        if self._keeps and (episode.terminated or episode.truncated):
+        if error is None and self._keeps and (episode.terminated or episode.truncated):
             self._put(end_of(episode))
             self._keeps = None  # the steps of ended agents follow
-        elif self._keeps is False:
+        elif error is not None or self._keeps is False:  # without a decision, or as it is wanted
             self._put = None
             self.path.unlink(missing_ok=True)
         return ""

@@ -238,7 +238,8 @@ class Session(BaseSession):
             raise
         try:
             episode.begin(events, check)
-        except BaseException:
+        except BaseException as error:
+            episode.tape.end(error)
             episode.stop()  # an interrupt may have come before
             if not episode.running:
                 self.episode = None

@@ -38,7 +38,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
 
     @property
     def latest(self) -> StepResult:
-        """The results of ``last()``."""
+        """The results of ``last()``; in the other views, of the latest ``reset`` or ``step``."""
         return self.last()
 
     def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:

@@ -47,6 +47,8 @@ class _CommonOptions(TypedDict, total=False):
     state_in_info: bool
     state_space: Space[Any] | Literal["observations"] | None
     render_mode: str | None
+    record: str | PathLike[str] | None
+    record_all: bool
 
 
 class EpisodeOptions(_CommonOptions, total=False):
@@ -63,9 +65,6 @@ class CheckOptions(_CommonOptions, total=False):
 
 class ViewOptions(EpisodeOptions, CheckOptions, total=False):
     """The options of functions that make environments."""
-
-    record: str | PathLike[str] | None
-    record_all: bool
 
 
 def _is_bool(value: object) -> bool:

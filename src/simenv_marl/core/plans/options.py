@@ -47,8 +47,6 @@ class _CommonOptions(TypedDict, total=False):
     state_in_info: bool
     state_space: Space[Any] | Literal["observations"] | None
     render_mode: str | None
-    record: str | PathLike[str] | None
-    record_all: bool
 
 
 class EpisodeOptions(_CommonOptions, total=False):
@@ -61,6 +59,8 @@ class CheckOptions(_CommonOptions, total=False):
     """The options of functions that check a simulation and have their own ``max_steps``."""
 
     policies: Mapping[Any, Any] | None
+    record: str | PathLike[str] | None
+    record_all: bool
 
 
 class ViewOptions(EpisodeOptions, CheckOptions, total=False):

@@ -155,3 +155,20 @@ def test_numbers_that_cannot_be_used(command, options, capsys):
         option, value = each.split()
         assert main([command, f"--{option}", value, target]) == 2
         assert option.replace("-", "_") in capsys.readouterr().err
+
+
+def test_an_episode_of_a_file_is_shown_up_to_a_decision(capsys):
+    from tests.files.test_episodes import begun, save_episode
+
+    env = begun(taken=5)
+    save_episode(env, "episode")
+    assert main(["replay", "episode"]) == 0
+    head, *decisions, now = capsys.readouterr().out.splitlines()
+    assert head == "yard, view aec, seed 7"
+    assert [line.split()[0] for line in decisions] == ["1", "2", "3", "4", "5"]
+    assert decisions[0].startswith("     1  at 0  planner: ")
+    assert now == f"now: a decision of {env.agent_selection!r}"
+    assert main(["replay", "episode", "--until", "2"]) == 0
+    assert capsys.readouterr().out.splitlines()[:3] == [head, *decisions[:2]]
+    assert main(["replay", "nowhere"]) == 2
+    assert "nowhere cannot be read" in capsys.readouterr().err

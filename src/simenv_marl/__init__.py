@@ -14,7 +14,7 @@ To begin with:
 - ``aec_env``, ``parallel_env``, ``single_env``, ``joint_env`` and ``vector_env`` make environments;
 - ``RULE`` as an action lets the model's own function decide;
 - ``simulate`` and ``evaluate`` run the simulation with policies, and compare these with the rule;
-- ``clone`` copies an environment in mid-episode;
+- ``clone`` copies an environment in mid-episode, ``save_episode`` writes its episode to a file;
 - ``python -m simenv_marl check MODULE:SIMULATION`` checks a simulation.
 
 All other names are in rooms, which are imported when they are first used:
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         turn_env,
         vector_env,
     )
+    from .episodes import load_episode, save_episode
     from .errors import SimEnvError
     from .experiments.evaluation import evaluate
     from .registration import register_simulation
@@ -61,8 +62,8 @@ __version__ = "0.1.0"
 __all__ = [
     "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation",
     "Streams", "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env",
-    "make_step", "parallel_env", "register_simulation", "reseed_generators", "simulate",
-    "simulate_many", "single_env", "turn_env", "vector_env",
+    "load_episode", "make_step", "parallel_env", "register_simulation", "reseed_generators",
+    "save_episode", "simulate", "simulate_many", "single_env", "turn_env", "vector_env",
 ]  # fmt: skip
 
 ROOMS = (
@@ -91,6 +92,7 @@ _MODULES = {
         "turn_env",
         "vector_env",
     ),
+    "episodes": ("load_episode", "save_episode"),
     "errors": ("SimEnvError",),
     "experiments.evaluation": ("evaluate",),
     "runs": ("simulate", "simulate_many"),

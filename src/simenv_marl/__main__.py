@@ -1,4 +1,4 @@
-"""The command line: ``python -m simenv_marl new|check|inspect|play|wire-check``.
+"""The command line: ``python -m simenv_marl new|check|inspect|play|replay|wire-check``.
 
 Exit codes: 0 for success; 1 if a check has found errors; 2 if an argument is invalid, the
 simulation cannot be made, or a file cannot be written.
@@ -45,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     about = (
-        "Write a template to start from; check, inspect or play a simulation; test a simulator in"
-        " another process."
+        "Write a template to start from; check, inspect or play a simulation; repeat the episode of"
+        " a file; test a simulator in another process."
     )
     parser = argparse.ArgumentParser(prog="python -m simenv_marl", description=about)
     commands = parser.add_subparsers(required=True, metavar=" | ".join(_COMMANDS))
@@ -104,6 +104,12 @@ def _play(
         record=options["record"],
     )
     return start(make, **options)
+
+
+def _replay(file: Path, until: int | None) -> str:
+    from .episodes import replay_episode
+
+    return replay_episode(file, until)
 
 
 def _wire_check(program: list[str], **limits: Any) -> WireReport:
@@ -305,6 +311,22 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., object], str, _Arguments]]] = {
                 "choices": ("all", "facilitator", "none"),
                 "default": "all",
                 "help": "who may undo, jump, restart and let the rule play on (default: all)",
+            },
+        },
+    ),
+    "replay": (
+        _replay,
+        "repeat the episode of a file, and show its decisions",
+        {
+            "file": {
+                "type": Path,
+                "metavar": "FILE",
+                "help": "a file of save_episode, or of the option record",
+            },
+            "--until": {
+                "type": int,
+                "metavar": "N",
+                "help": "stop after N decisions (default: all of the file)",
             },
         },
     ),

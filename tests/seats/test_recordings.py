@@ -15,8 +15,8 @@ from gymnasium import spaces
 from simenv_marl import RULE, evaluate
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import OptionValueError
+from simenv_marl.files.values import digest_of
 from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, RecordedPolicy
-from simenv_marl.seats.recordings import digest_of
 
 from .tank import FILL, POINTS, Tank, filling, levels, played
 

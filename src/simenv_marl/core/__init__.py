@@ -16,15 +16,25 @@ from .copies.clone import branch, clone, pending_view
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from .copies.peer import Peer, pack_request, serve
 from .episodes.agent import Agent
-from .episodes.base import BaseSession, StateReader, checked_seed, close_all
+from .episodes.base import (
+    GO_ON,
+    BaseSession,
+    Recording,
+    Replay,
+    Reseeded,
+    StateReader,
+    Tape,
+    checked_seed,
+    close_all,
+)
 from .episodes.decision import Decision
 from .episodes.episode import Episode
 from .episodes.session import Session
-from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
+from .episodes.state import EpisodeState, Outcome, UnmatchedNames, checked_actions
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space
-from .plans.points import Points, portable
+from .plans.points import Points, find_point, portable
 from .plans.policies import (
     COUNTS,
     AskingPolicy,
@@ -83,6 +93,7 @@ __all__ = [  # noqa: RUF022 - by subject
     "split_extras", "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
+    "GO_ON", "Outcome", "Recording", "Replay", "Reseeded", "Tape", "find_point",
     "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
     "unpack_outcome",
     # Values.

@@ -26,7 +26,7 @@ from ..core import (
     takes_state,
 )
 from ..envs import SimulationJointEnv, SimulationTurnEnv
-from ..envs.base import OneAgentView
+from ..envs.agents import OneAgentView
 from ..envs.joint import Joint
 from ..envs.turn import Turn
 from ..errors import OptionValueError, UnknownAgentError, name_of, short_repr

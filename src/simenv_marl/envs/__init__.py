@@ -26,12 +26,15 @@ __all__ = [
     "SimulationTurnEnv", "SimulationVectorEnv", "pad_agents",
 ]  # fmt: skip
 
-VIEWS: Final = {
-    "aec": SimulationAECEnv,
-    "parallel": SimulationParallelEnv,
-    "single": SimulationEnv,
-    "joint": SimulationJointEnv,
-    "turn": SimulationTurnEnv,
+VIEWS: Final[dict[str, type[Any]]] = {
+    kind.kind: kind
+    for kind in (
+        SimulationAECEnv,
+        SimulationParallelEnv,
+        SimulationEnv,
+        SimulationJointEnv,
+        SimulationTurnEnv,
+    )
 }
 """The classes of the views of one simulation."""
 

@@ -34,6 +34,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
             observed, its mask has all actions legal.
     """
 
+    kind = "aec"
+
+    @property
+    def latest(self) -> StepResult:
+        """The results of ``last()``; in the other views, of the latest ``reset`` or ``step``."""
+        return self.last()
+
     def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:
         """Reset the simulation and run it to its first decision.
 
@@ -125,6 +132,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
 
     # -- attributes of PettingZoo -----------------------------------------------------------------
 
+    def repeat(self, answer: Action) -> None:
+        """Take a step with an answer of the tape, after the ``None`` steps before it."""
+        while self._leaving:
+            self.step(None)
+        self.step(answer)
+
     def _clear(self) -> None:
         self.agents = []
         self._places: dict[str, int] = {}  # the index of each agent in ``agents``
@@ -209,6 +222,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
             )
         self._clear_rewards()
         name = self._leaving.pop()
+        self.session.note_exit(name)
         del self.rewards[name]
         del self._cumulative_rewards[name]
         del self.terminations[name]

@@ -1,12 +1,19 @@
-"""The parts that the views of several agents share, with several learners or with one."""
+"""The parts that views share: those with one agent, with several, and with one learner for all."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
-from ..core import EpisodeState, Info, Plan, Space
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ..core import Action, Agent, EpisodeState, Info, Mask, Observation, Plan, Space
 from ..errors import ViewError
-from .base import OneAgentView, View
+from .base import ResetOptions, StepResult, View
 
 
 def refuse_unknown_agents(plan: Plan) -> None:
@@ -82,6 +89,109 @@ class AgentsView(View):
         return {agent: self.action_space(agent) for agent in self.possible_agents}
 
 
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent: a Gymnasium environment.
+
+    Attributes:
+        own_agent: The agent that decides, during an episode. The joint view has none.
+    """
+
+    own_agent: Agent
+    _agent_name: str
+    # Gymnasium's checks look here.
+    _np_random = View.np_random
+    _np_random_seed = View.np_random_seed
+
+    @cached_property
+    def observation_space(self) -> Space:  # type: ignore[override]
+        """The observation space. No other environment shares it."""
+        return self._spaces_of(self._agent_name)[0]
+
+    @cached_property
+    def action_space(self) -> Space:  # type: ignore[override]
+        """The action space. No other environment shares it."""
+        return self._spaces_of(self._agent_name)[1]
+
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the observation space and the action space of an adapted plan."""
+        raise NotImplementedError
+
+    def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
+        """Prepare for a new episode; return the results of its reset."""
+        raise NotImplementedError
+
+    def read(self, episode: EpisodeState) -> StepResult:
+        """Return the results of a step."""
+        raise NotImplementedError
+
+    @classmethod
+    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
+        """Return the observations, rewards and infos of the latest step of several views."""
+        results = [view.read(view.episode) for view in views]
+        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
+        return observations, rewards, infos
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action for the pending decision, before the simulation moves."""
+        raise NotImplementedError
+
+    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
+        """Return how an episode has ended: whether terminated, whether truncated."""
+        return episode.terminated, episode.truncated
+
+    def _clear(self) -> None:
+        super()._clear()
+        if hasattr(self, "own_agent"):
+            del self.own_agent  # because it holds arguments of the model
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: ResetOptions = None,
+    ) -> tuple[Observation, Info]:
+        """Reset the simulation and run it to its first decision.
+
+        For the arguments and errors, see ``SimulationAECEnv.reset``.
+
+        Returns:
+            The observation and the info.
+        """
+        return self._start(seed, options, self.begin)
+
+    def masks(self) -> list[Mask]:
+        """Return the masks of the actions that are legal now, one for each agent."""
+        return [
+            agent.point.open_mask() if agent.mask is None else agent.mask
+            for agent in self.known_agents()
+        ]
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return the mask of the legal actions, as ``MaskablePPO`` of sb3-contrib expects it.
+
+        Returns:
+            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is
+            the concatenation of the masks of the parts. If the decision point does not restrict its
+            actions, all entries are True.
+
+        Raises:
+            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no
+                masks.
+            ResetNeededError: There is no episode.
+        """
+        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+            raise ViewError(
+                "action masks need a Discrete or MultiDiscrete action space, not"
+                f" {self.action_space}; a joint environment of discrete actions has a"
+                " MultiDiscrete with flatten=True"
+            )
+        parts: list[Any] = []
+        for mask in self.masks():
+            parts += mask if isinstance(mask, tuple) else (mask,)
+        return np.concatenate(parts).astype(np.bool_)
+
+
 class UnitedView(OneAgentView):
     """A view with one learner for all agents, which have united spaces."""
 
@@ -97,6 +207,19 @@ class UnitedView(OneAgentView):
 
     def _original_spaces(self, agent: str) -> tuple[Space, Space]:
         return self.spaces_of(self.session.plan)
+
+    def _move(self, episode: EpisodeState, answer: Action) -> StepResult:
+        """Take a step with the agents' own actions; return its results."""
+        episode.step(answer)
+        if self._shows:
+            self.show_step()
+        self._latest = results = self.read(episode)
+        return results
+
+    def repeat(self, answer: Action) -> None:
+        """Take a step with an answer of the tape."""
+        with self.session.exclusive:
+            self._move(self.episode, answer)
 
     def _add_to(self, info: Info, episode: EpisodeState) -> None:
         """Add the time since the last step, and the state, to an info."""

@@ -5,15 +5,12 @@ from __future__ import annotations
 import copy
 import pickle
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Self, TypeAlias, TypeVar
 from zlib import crc32
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import NDArray
 
 from ..core import (
     Action,
@@ -21,7 +18,6 @@ from ..core import (
     BaseSession,
     EpisodeState,
     Info,
-    Mask,
     Model,
     Observation,
     Plan,
@@ -38,12 +34,12 @@ from ..errors import (
     AgentError,
     UnknownAgentError,
     UnknownOptionError,
-    ViewError,
     did_you_mean,
     listed,
     short_repr,
     warn_user,
 )
+from ..files.tapes import recorder
 from ..plugins import Entry
 
 Result = TypeVar("Result")
@@ -88,15 +84,19 @@ class View:
         _clear            when an episode ends                      AEC, parallel, single, turn
         check_pending     before a branch or a clone is made        View, planner
         begin_branch      in a new branch or clone                  planner
+        repeat            when an episode is loaded from a file     AEC, joint, turn
 
     Attributes:
+        kind: The name of the view, as ``generate_env`` takes it.
         session: The session of the simulation.
         metadata: Its name, and the render modes of its simulation.
         render_mode: The form of the result of ``render``.
         in_rounds: Whether all agents are updated when a step returns.
     """
 
+    kind = ""
     in_rounds = False
+    _latest: Any = None  # the results of the latest reset or step
     _has_warned_of_losses = False
     _own_options: tuple[str, ...] = ()  # options that other views refuse
 
@@ -127,6 +127,8 @@ class View:
         self.session = session
         self._lock = session.lock
         self._finalizer = weakref.finalize(self, session.abandon) if owned else None
+        if plan.options.record is not None and self.kind and isinstance(session, Session):
+            session.make_tapes(recorder(plan, self.kind))
         self._roster = plan.roster  # the decision points of the agents that are known beforehand
         if attributes:  # because ``vars`` makes the attributes of an object slower
             vars(self).update(attributes)
@@ -245,6 +247,16 @@ class View:
             raise self.session.refusal()
         return episode
 
+    @property
+    def latest(self) -> Any:
+        """The results of the latest ``reset`` or ``step``; in the AEC view, of ``last()`` now.
+
+        Raise ``ResetNeededError`` if there are none.
+        """
+        if self._latest is None:
+            raise self.session.refusal()
+        return self._latest
+
     def known_agents(self) -> list[Agent]:
         """Return the agents that are known beforehand.
 
@@ -324,7 +336,7 @@ class View:
                 self._forget_ended()
                 raise
             self._clear()
-            results = begin(episode)
+            self._latest = results = begin(episode)
             if not session.plan.complete:  # the agents of the last episode may never appear again
                 self._spaces = {}
             for agent in self._spaces:
@@ -363,6 +375,7 @@ class View:
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
+        self._latest = None
 
     # -- spaces -----------------------------------------------------------------------------------
 
@@ -475,6 +488,11 @@ class View:
         if self.episode.pending is None:
             raise self.session.refusal()
 
+    def repeat(self, answer: Action) -> None:
+        """Take a step with an answer of the tape."""
+        step: Callable[[Action], object] = self.step  # type: ignore[attr-defined]
+        step(answer)
+
     def begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
@@ -496,105 +514,3 @@ def _unpickled(parcel: bytes) -> View:
     made: View = view.__new__(view)
     made._imitate(*recipe)
     return made
-
-
-class OneAgentView(View, gym.Env[Any, Any]):
-    """A view with one agent: a Gymnasium environment.
-
-    Attributes:
-        own_agent: The agent that decides, during an episode. The joint view has none.
-    """
-
-    own_agent: Agent
-    _agent_name: str
-    # Gymnasium's checks look here.
-    _np_random = View.np_random
-    _np_random_seed = View.np_random_seed
-
-    @cached_property
-    def observation_space(self) -> Space:  # type: ignore[override]
-        """The observation space. No other environment shares it."""
-        return self._spaces_of(self._agent_name)[0]
-
-    @cached_property
-    def action_space(self) -> Space:  # type: ignore[override]
-        """The action space. No other environment shares it."""
-        return self._spaces_of(self._agent_name)[1]
-
-    @classmethod
-    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
-        """Return the observation space and the action space of an adapted plan."""
-        raise NotImplementedError
-
-    def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
-        """Prepare for a new episode; return the results of its reset."""
-        raise NotImplementedError
-
-    def read(self, episode: EpisodeState) -> StepResult:
-        """Return the results of a step."""
-        raise NotImplementedError
-
-    @classmethod
-    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
-        """Return the observations, rewards and infos of the latest step of several views."""
-        results = [view.read(view.episode) for view in views]
-        observations, rewards, _, _, infos = map(list, zip(*results, strict=True))
-        return observations, rewards, infos
-
-    def validate(self, action: Action) -> Action:
-        """Validate an action for the pending decision, before the simulation moves."""
-        raise NotImplementedError
-
-    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return how an episode has ended: whether terminated, whether truncated."""
-        return episode.terminated, episode.truncated
-
-    def _clear(self) -> None:
-        if hasattr(self, "own_agent"):
-            del self.own_agent  # because it holds arguments of the model
-
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        options: ResetOptions = None,
-    ) -> tuple[Observation, Info]:
-        """Reset the simulation and run it to its first decision.
-
-        For the arguments and errors, see ``SimulationAECEnv.reset``.
-
-        Returns:
-            The observation and the info.
-        """
-        return self._start(seed, options, self.begin)
-
-    def masks(self) -> list[Mask]:
-        """Return the masks of the actions that are legal now, one for each agent."""
-        return [
-            agent.point.open_mask() if agent.mask is None else agent.mask
-            for agent in self.known_agents()
-        ]
-
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return the mask of the legal actions, as ``MaskablePPO`` of sb3-contrib expects it.
-
-        Returns:
-            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is
-            the concatenation of the masks of the parts. If the decision point does not restrict its
-            actions, all entries are True.
-
-        Raises:
-            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no
-                masks.
-            ResetNeededError: There is no episode.
-        """
-        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
-            raise ViewError(
-                "action masks need a Discrete or MultiDiscrete action space, not"
-                f" {self.action_space}; a joint environment of discrete actions has a"
-                " MultiDiscrete with flatten=True"
-            )
-        parts: list[Any] = []
-        for mask in self.masks():
-            parts += mask if isinstance(mask, tuple) else (mask,)
-        return np.concatenate(parts).astype(np.bool_)

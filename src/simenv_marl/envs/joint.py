@@ -162,6 +162,7 @@ class SimulationJointEnv(UnitedView):
         joint: The agents, combined into one.
     """
 
+    kind = "joint"
     in_rounds = True
     _agent_name = "joint"
     _unite = Joint
@@ -209,10 +210,7 @@ class SimulationJointEnv(UnitedView):
         episode = self.session.episode
         if episode is None or (self._lock and not self._lock.held):
             return self._step_in_lock(SimulationJointEnv.step, action)
-        episode.step(self.joint.actions(episode.agents, action))
-        if self._shows:
-            self.show_step()
-        return self.read(episode)
+        return self._move(episode, self.joint.actions(episode.agents, action))
 
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Return the observation and the info of a reset."""

@@ -39,6 +39,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         agents: The live agents.
     """
 
+    kind = "parallel"
     in_rounds = True
 
     def reset(
@@ -55,7 +56,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         """
         observations, *_, infos = self._start(seed, options, self.begin)
         self.agents = list(observations)
-        return observations, infos
+        self._latest = results = observations, infos
+        return results
 
     def step(self, actions: Mapping[str, Action] | Sentinel) -> Results:
         """Play a round.
@@ -80,7 +82,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         if episode is None or (self._lock and not self._lock.held):
             return self._step_in_lock(SimulationParallelEnv.step, actions)
         if not self.agents and not actions and (episode.terminated or episode.truncated):
-            return {}, {}, {}, {}, {}  # as PettingZoo's own environments do
+            nothing: Results = {}, {}, {}, {}, {}  # as PettingZoo's own environments do
+            self._latest = nothing
+            return nothing
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
         try:
@@ -91,7 +95,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
             raise
         is_over = episode.pending is None and episode.over
         self.agents = [] if is_over else list(episode.agents)
-        results = self.begin(episode)
+        self._latest = results = self.begin(episode)
         if is_over:
             self.warn_of_losses(episode)
         if self._shows:
@@ -130,4 +134,5 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         )
 
     def _clear(self) -> None:
+        super()._clear()
         self.agents = []

@@ -27,7 +27,8 @@ from ..core import (
 )
 from ..errors import CopyError, ReentrancyError, ViewError
 from ..simulation import asks_for
-from .base import OneAgentView, ResetOptions, StepResult
+from .agents import OneAgentView
+from .base import ResetOptions, StepResult
 
 _REFUSAL = (
     "a policy cannot move the environment that it is given: it must return an action; branch tries"
@@ -60,6 +61,7 @@ class SimulationEnv(OneAgentView):
         own_agent: The agent, during an episode.
     """
 
+    kind = "single"
     _own_options = ("agent",)
 
     def set_up(self) -> None:
@@ -137,13 +139,14 @@ class SimulationEnv(OneAgentView):
         terminated = truncated = False
         if episode.pending is None:
             terminated, truncated = self.read_end(episode)
-        return (
+        self._latest = results = (
             agent.hand_out(),
             agent.reward,
             terminated,
             truncated,
             agent.info,
         )
+        return results
 
     @classmethod
     def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
@@ -217,6 +220,7 @@ class PlannerEnv(SimulationEnv):
     of the agent, which can be stepped; policies or rules answer for all other agents.
     """
 
+    kind = ""  # files have the environment that the planner decides in
     _branched = False  # whether it is a branch, or a clone
 
     def set_up(self) -> None:

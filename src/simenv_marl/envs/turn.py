@@ -174,6 +174,7 @@ class SimulationTurnEnv(UnitedView):
         own_seat: The seat of the agent whose decision is pending, or was the last one.
     """
 
+    kind = "turn"
     own_seat: Seat
     _agent_name = "turn"
     _unite = Turn
@@ -232,7 +233,8 @@ class SimulationTurnEnv(UnitedView):
             self.show_step()
         agent = episode.pending
         if agent is None or agent.info or episode.just_ended or not turn.is_plain:
-            return self.read(episode)
+            self._latest = results = self.read(episode)
+            return results
         # The same as in ``read``, whose call and checks take a twentieth of a step.
         self.own_agent = agent
         seat = turn.seats[agent.point.hook]
@@ -241,7 +243,8 @@ class SimulationTurnEnv(UnitedView):
         if renew is not None:
             info[MASK] = renew()
         observation = {"kind": seat.kind, "observation": agent.hand_out()}
-        return observation, agent.reward, False, False, info
+        self._latest = quick = observation, agent.reward, False, False, info
+        return quick
 
     def read(self, episode: EpisodeState, *, begins: bool = False) -> StepResult:
         """Return the results of a step, or of a reset, which leaves rewards to the first step."""

@@ -37,7 +37,8 @@ from ..errors import (
 )
 from ..many.parallel import WorkerPool
 from ..simulation import RULE, check_count
-from .base import OneAgentView, ResetOptions
+from .agents import OneAgentView
+from .base import ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
 from .turn import SimulationTurnEnv

@@ -26,7 +26,8 @@ from ..core import (
 )
 from ..errors import InvalidActionError, annotate
 from ..many.batch import step_all
-from .base import OneAgentView, ResetOptions
+from .agents import OneAgentView
+from .base import ResetOptions
 from .single import plan_of
 
 Infos = list[tuple[int, Info]]

@@ -19,13 +19,13 @@ from ..errors import (
     describe_error,
     short_repr,
 )
+from ..files.values import digest_of
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation, check_count
 from . import descriptions
 from .answers import parse
 from .descriptions import Schema, action_schema, at_decision
 from .policies import kind_of
-from .recordings import digest_of
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""

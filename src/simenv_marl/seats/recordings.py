@@ -1,15 +1,11 @@
 """Recordings: files with a line of JSON for each answer of a policy."""
 
-import json
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from itertools import chain
-from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
 
@@ -18,43 +14,12 @@ from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Tuple
 
 from ..core import Decision, PolicyWrapper, Space, split_extras
 from ..errors import OptionValueError, warn_user
-from ..simulation import RULE, Action, Observation
+from ..files.lines import Lines
+from ..files.values import decode_value, digest_of, encode_value
+from ..simulation import RULE, Action
 
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 """The part of an object's text that differs from run to run."""
-
-
-# -- files ----------------------------------------------------------------------------------------
-
-
-class Lines:
-    """A file with a line of JSON for each value. It is open only while it is read or written."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Name the file. The first line creates it."""
-        self.path = Path(path)
-
-    def read(self) -> Iterator[tuple[int, Any]]:
-        """Yield the numbers of the lines, from 1, and their values.
-
-        Lines that a crash has torn are left out.
-        """
-        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
-            with suppress(ValueError):
-                yield number, json.loads(line)
-
-    def append(self, *values: Any) -> None:
-        """Append lines, in one call, so that processes can share the file.
-
-        They begin on a new line, also where a crash or a full disk has torn the last one.
-        """
-        lines = [json.dumps(value, ensure_ascii=False) for value in values]
-        text = "".join(f"{line}\n" for line in lines).encode()
-        with open(self.path, "ab+", buffering=0) as file:
-            if file.tell():
-                file.seek(-1, os.SEEK_END)
-                text = text if file.read(1) == b"\n" else b"\n" + text
-            file.write(text)
 
 
 # -- answers --------------------------------------------------------------------------------------
@@ -157,7 +122,7 @@ class Recording(Lines):
         entry = question | vars(outcome) | {"run": self._run}
         is_rule = outcome.action is RULE
         entry["action"] = None if is_rule else encode(decision.action_space, outcome.action)
-        entry["extras"] = {name: _encode_part(part) for name, part in outcome.extras.items()}
+        entry["extras"] = {name: encode_value(part) for name, part in outcome.extras.items()}
         optional = ("policy", "extras", "why", "counts")
         entry = {name: part for name, part in entry.items() if part or name not in optional}
         self.append(entry)
@@ -228,7 +193,7 @@ def _outcome_in(entry: Entry, space: Space) -> Outcome:
         sample = entry["answer"]
         return Outcome(RULE if sample is None else space.from_jsonable(sample)[0])
     action = RULE if entry["action"] is None else decode(space, entry["action"])
-    extras = {name: _decode_part(part) for name, part in entry.get("extras", {}).items()}
+    extras = {name: decode_value(part) for name, part in entry.get("extras", {}).items()}
     others = {name: entry[name] for name in ("by", "why", "counts") if name in entry}
     return Outcome(action, extras, **others)
 
@@ -247,7 +212,7 @@ def encode(space: Space, action: Action) -> Any:
             return space.to_jsonable([action])
     if isinstance(action, np.ndarray) and action.ndim and action.dtype == space.dtype:
         return action.tolist()
-    return _encode_part(action)
+    return encode_value(action)
 
 
 def decode(space: Space, value: Any) -> Action:
@@ -259,46 +224,4 @@ def decode(space: Space, value: Any) -> Action:
             return tuple(decode(*pair) for pair in zip(space.spaces, value, strict=True))
         case Sequence() | Graph() | OneOf():
             return space.from_jsonable(value)[0]
-    return np.array(value, space.dtype) if isinstance(value, list) else _decode_part(value)
-
-
-def _encode_part(part: Any) -> Any:
-    """Return an array or a number as JSON, with its dtype."""
-    match part:
-        case np.ndarray():
-            return {"array": part.tolist(), "dtype": part.dtype.str}
-        case np.generic():
-            return {"scalar": part.item(), "dtype": part.dtype.str}
-    return part
-
-
-def _decode_part(value: Any) -> Any:
-    match value:
-        case {"array": numbers, "dtype": dtype}:
-            return np.array(numbers, dtype)
-        case {"scalar": number, "dtype": dtype}:
-            return np.dtype(dtype).type(number)
-    return value
-
-
-def digest_of(observation: Observation) -> str:
-    """Return a digest of an observation: of the names, types, shapes and bytes of its parts."""
-    digest = blake2b(digest_size=12)
-
-    def add(part: Observation) -> None:
-        match part:
-            case Mapping():
-                for name in sorted(part, key=str):
-                    digest.update(str(name).encode())
-                    add(part[name])
-            case tuple() | list():
-                for item in part:
-                    add(item)
-            case np.ndarray() | np.generic() if part.dtype != object:
-                digest.update(f"{part.dtype.str}{part.shape}".encode())
-                digest.update(np.ascontiguousarray(part).tobytes())
-            case _:
-                digest.update(repr(part).encode())
-
-    add(observation)
-    return digest.hexdigest()
+    return np.array(value, space.dtype) if isinstance(value, list) else decode_value(value)

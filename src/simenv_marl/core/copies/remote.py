@@ -338,6 +338,9 @@ class RemoteSession(BaseSession):
         recording: Recording = self._fork.request(Host.ask, Session.recording)
         return recording
 
+    def note_exit(self, agent: str) -> None:
+        """Do nothing, because nothing is recorded in clones."""
+
     def leave_caller(self) -> None:
         """Do nothing, because the clone's process has done it."""
 

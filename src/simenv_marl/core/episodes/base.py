@@ -22,7 +22,7 @@ from ...errors import (
     short_repr,
 )
 from ...hooks.hook import Hook
-from ...simulation import RULE, Action, Model, Observation
+from ...simulation import RULE, Action, Model, Observation, Sentinel
 from ..plans.plan import Plan
 from ..plans.point import Point, Policy, Space
 from ..plans.points import resolve_roster
@@ -83,6 +83,30 @@ LONGEST_TAPE: Final = 200_000
 Replay: TypeAlias = deque[Action]
 """The answers of another episode that are not repeated yet. They replace those of all policies."""
 
+GO_ON: Final = Sentinel("GO_ON")
+"""At the end of a replay: policies are asked again from here on."""
+
+
+@dataclass(frozen=True)
+class Reseeded:
+    """On a tape: here the simulation was reseeded."""
+
+    seed: int
+
+
+class Tape(list[Action]):
+    """The answers of the user and of policies. A file of an episode has a tape that writes them."""
+
+    __slots__ = ()
+
+    def note_exit(self, agent: str) -> None:
+        """Note that an agent that has ended was taken out of the view."""
+
+    def end(self, error: BaseException | None = None) -> str:
+        """Note that the episode has ended, or failed. Return a hint for the note of its error."""
+        is_short = error is None or not self
+        return "" if is_short else "; save_episode(env, path) writes the episode to a file"
+
 
 class EpisodeOwner(Protocol):
     """The session, as its episodes use it."""
@@ -92,6 +116,9 @@ class EpisodeOwner(Protocol):
     handlers: Handlers
     context: Callable[..., environment_context]
     unmatched_names: UnmatchedNames
+
+    def new_tape(self) -> Tape:
+        """Return the tape for another episode."""
 
     def read_state(self) -> Model:
         """Return the state of the simulation."""
@@ -224,6 +251,10 @@ class BaseSession(ABC):
     @abstractmethod
     def reseed(self, seed: int) -> None:
         """Draw the simulation's future chance anew."""
+
+    @abstractmethod
+    def note_exit(self, agent: str) -> None:
+        """Note that an agent that has ended was taken out of the view."""
 
     @abstractmethod
     def recording(self) -> Recording:

@@ -51,7 +51,7 @@ from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
-from .base import LONGEST_TAPE, EpisodeOwner, Replay
+from .base import GO_ON, LONGEST_TAPE, EpisodeOwner, Replay, Tape
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
 from .steps import Round, Team
@@ -72,7 +72,7 @@ class Episode(EpisodeState):
         is_plain: Whether a decision of the user's agents is just updated, and waits.
         moved: The names of agents that have decided at several points.
         end_states: The states at the ends of agents midway. None if no learner has asked for any.
-        tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
+        tape: The answers so far. If it is full, later ones are lost.
         replay: The answers of the episode that this one repeats. None in ordinary episodes.
     """
 
@@ -115,7 +115,7 @@ class Episode(EpisodeState):
         if plan.options.team_reward is not None:
             self.team = Team(partial(plan.options.team_reward, simulation), self._plugins)
         self.is_plain = not (in_rounds or self.skips or self.team)
-        self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
+        self.tape = session.new_tape()
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
@@ -359,6 +359,8 @@ class Episode(EpisodeState):
 
     def _consult(self, agent: Agent, policy: Policy) -> Action:
         """Call the policy of an agent. ``WAIT`` where a replay ends."""
+        if self.replay and self.replay[0] is GO_ON:
+            self.replay = None
         if self.replay is not None:
             if not self.replay:  # the other episode stands here
                 self.consulted = self.pending = agent
@@ -558,7 +560,7 @@ class Episode(EpisodeState):
         """In a branch, wait for one agent alone. Policies answer for the others, else the rule."""
         self.plan = self.plan.for_one(agent.name)
         self.move_to(Where.BRANCH)
-        self.tape = []  # it cannot be replayed, because this is not on the tape
+        self.tape = Tape()  # it cannot be replayed, because this is not on the tape
         self._tape_size = 0
         for name, other in self.agents.items():
             if other is not agent:
@@ -615,13 +617,14 @@ class Episode(EpisodeState):
         if self.team is not None:
             self.earned = self.team.settle(self.agents.values())
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
+        self.tape.end()
         session = self.session()
         if session is not None and (self.plan.named_agents or self.plan.removers):
             session.unmatched_names.check(self, None if self.running else self.called)
 
     # -- errors, and the end by a close -----------------------------------------------------------
 
-    def annotate(self, error: BaseException) -> None:
+    def annotate(self, error: BaseException, hint: str = "") -> None:
         """Add a note to an error: the decision and the agent where it arose."""
         agent = self.latest
         if agent is None:
@@ -630,14 +633,14 @@ class Episode(EpisodeState):
             where = f"in the model, after decision {self.turns}, {agent.place}"
         else:
             where = f"at decision {self.turns + 1}, {agent.place}"
-        annotate(error, f"simenv_marl: {where}; seed {self.seed}")
+        annotate(error, f"simenv_marl: {where}; seed {self.seed}{hint}")
 
     def fail(self, error: BaseException) -> None:
         """End the episode because of an error, and note in the error where it arose."""
         self.pending = None  # first, because the next call may come to the end of the stack
         if self.outcome is RUNNING:
             self.outcome = Outcome.STOPPED
-        self.annotate(error)
+        self.annotate(error, self.tape.end(error))
         try:
             problems = self._unwind()
         except Warning as warning:  # warnings may be errors; this one must not replace the error

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -34,7 +33,16 @@ from ..switching.driver import Driver, Job
 from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.spaces import same
 from .agent import Clock
-from .base import LONGEST_TAPE, BaseSession, PendingDecision, Recording, Replay, ResetOptions
+from .base import (
+    LONGEST_TAPE,
+    BaseSession,
+    PendingDecision,
+    Recording,
+    Replay,
+    Reseeded,
+    ResetOptions,
+    Tape,
+)
 from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames
@@ -53,8 +61,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_defined", "_driver", "_homes", "_installed", "_reset", "_rng",
-        "_simulation", "context", "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_defined", "_driver", "_homes", "_installed", "_make_tape", "_replay",
+        "_reset", "_rng", "_simulation", "context", "episode", "handlers", "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
@@ -68,6 +76,8 @@ class Session(BaseSession):
         """
         super().__init__(plan, Where.USER)
         self.episode = None
+        self._make_tape: Callable[[Session], Tape] | None = None
+        self._replay: Replay | None = None
         self.unmatched_names = unmatched_names or UnmatchedNames(plan.named_agents)
         if plan.options.driver == "thread":
             self.lock = self.exclusive
@@ -162,6 +172,8 @@ class Session(BaseSession):
                 self._warn_of_outdated()
                 self.options = options
                 self.seed = self.seed_for(seed)
+                if replay is None:
+                    replay, self._replay = self._replay, None
                 more: list[int] | None = None
                 while True:
                     self._driver = self._driver.ready()
@@ -226,7 +238,8 @@ class Session(BaseSession):
             raise
         try:
             episode.begin(events, check)
-        except BaseException:
+        except BaseException as error:
+            episode.tape.end(error)
             episode.stop()  # an interrupt may have come before
             if not episode.running:
                 self.episode = None
@@ -293,6 +306,7 @@ class Session(BaseSession):
             episode.close()
         finally:
             if episode.over and not episode.running:
+                episode.tape.end()
                 self.episode = None
 
     @property
@@ -350,6 +364,23 @@ class Session(BaseSession):
 
     # -- replays ----------------------------------------------------------------------------------
 
+    def make_tapes(
+        self, make: Callable[[Session], Tape] | None, replay: Replay | None = None
+    ) -> None:
+        """Make the tapes of episodes by a function of the session. The next one is a replay."""
+        self._make_tape = make
+        self._replay = replay
+
+    def new_tape(self) -> Tape:
+        """Return the tape for another episode."""
+        is_user = self.where is Where.USER
+        return self._make_tape(self) if self._make_tape is not None and is_user else Tape()
+
+    def note_exit(self, agent: str) -> None:
+        """Note on the tape that an agent that has ended was taken out of the view."""
+        if self.episode is not None:
+            self.episode.tape.note_exit(agent)
+
     def recording(self) -> Recording:
         """Return the record for a replay of the episode."""
         episode = self.episode
@@ -362,7 +393,11 @@ class Session(BaseSession):
                 ' method="fork"'
             )
         return Recording(
-            episode.seed, self.options, episode.in_rounds, episode.tape, _pending_decision(episode)
+            episode.seed,
+            self.options,
+            episode.in_rounds,
+            [*episode.tape],
+            _pending_decision(episode),
         )
 
     def replay(self, original: BaseSession) -> None:
@@ -379,7 +414,7 @@ class Session(BaseSession):
         )
         while replay:
             answer = replay.popleft()
-            if isinstance(answer, _Reseeded):
+            if isinstance(answer, Reseeded):
                 self.reseed(answer.seed)
             else:
                 episode.step(answer)
@@ -432,7 +467,7 @@ class Session(BaseSession):
                     annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
                     raise
         if self.episode is not None:
-            self.episode.record(_Reseeded(seed))
+            self.episode.record(Reseeded(seed))
 
 
 def _within(
@@ -443,13 +478,6 @@ def _within(
             return function()
 
     return call
-
-
-@dataclass(frozen=True)
-class _Reseeded:
-    """On the tape of an episode: here the simulation was reseeded."""
-
-    seed: int
 
 
 def _pending_decision(episode: EpisodeState) -> PendingDecision | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from inspect import cleandoc
 from itertools import chain
 from math import inf
+from os import PathLike
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
@@ -58,6 +59,8 @@ class CheckOptions(_CommonOptions, total=False):
     """The options of functions that check a simulation and have their own ``max_steps``."""
 
     policies: Mapping[Any, Any] | None
+    record: str | PathLike[str] | None
+    record_all: bool
 
 
 class ViewOptions(EpisodeOptions, CheckOptions, total=False):
@@ -131,6 +134,14 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda policies: isinstance(policies, Mapping),
         "a dict from agents or points to callables",
     ),
+    "record": (
+        lambda folder: isinstance(folder, (str, PathLike)),
+        "a folder or None",
+    ),
+    "record_all": (
+        _is_bool,
+        "True or False",
+    ),
     "plugins": (
         _is_list,
         "a list of (handler, target, position)",
@@ -181,6 +192,9 @@ class Options:
             ``state()``. Agents that ``policies`` answers are no possible agents; where whole
             episodes run, only agents that policies answer are in the state.
         render_mode: The form of the result of ``render``: one of the simulation's ``render_modes``.
+        record: A folder, in which each episode is written to a file while it runs. The file stays
+            if an error or a kill ends the episode. ``load_episode`` loads it. None: no files.
+        record_all: Whether the files of all episodes stay.
     """
 
     driver: str = "greenlet"
@@ -199,6 +213,8 @@ class Options:
     state_in_info: bool = False
     state_space: Space[Any] | str | None = None
     render_mode: str | None = None
+    record: str | PathLike[str] | None = None
+    record_all: bool = False
 
     def __post_init__(self) -> None:
         for name, (is_valid, expected) in _VALID.items():

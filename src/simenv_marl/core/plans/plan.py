@@ -181,6 +181,7 @@ class Subject:
         render_fps: The number of images per second of a video.
         ends_agents: Whether the simulation has ``end_agent``.
         prototype: A simulation that was made to be inspected, if there is one.
+        given: The decision points as they were named, before a view has changed a definition.
     """
 
     source: Source
@@ -194,6 +195,7 @@ class Subject:
     render_fps: float
     ends_agents: bool
     prototype: Prototype | None
+    given: Definitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,10 +391,11 @@ def make_plan(
         source, points, options = variant.environment_arguments(points, options)
     checked = Options().amended(options)
     has_user = mode is Mode.ENVIRONMENT
-    if not has_user and checked.agent is not None:
-        raise UnknownOptionError(
-            "agent is an option of single views only, as single_env makes them"
-        )
+    for name, views in () if has_user else (("agent", "single views"), ("record", "environments")):
+        if getattr(checked, name) is not None:
+            raise UnknownOptionError(
+                f"{name} is an option of {views} only, as single_env makes them"
+            )
     prototype: Prototype | None = None
     inspected = source
     named = getattr(source, "points", None) if points is None else points
@@ -412,18 +415,20 @@ def make_plan(
     kind = inspected if isinstance(inspected, type) else type(inspected)
     modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))
     arguments = ("self", "mode") if inspected is kind else ("mode",)
+    found = find_points(points, own, empty=not has_user)
     subject = Subject(
         source,
         variant,
         mode,
         default_policy,
         planner_view,
-        find_points(points, own, empty=not has_user),
+        found,
         own,
         modes if optional_method(inspected, "render", *arguments) else [],
         getattr(inspected, "render_fps", 4),
         issubclass(kind, SimulationInterface),
         prototype,
+        found,
     )
     return _resolve(subject, checked)
 

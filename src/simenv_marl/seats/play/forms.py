@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ...core import Decision, Labels, Mask, Space, as_json
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
+from ...files.values import digest_of
 from ...simulation import RULE, Action
 from ..answers import MISFITS, to_action
 from ..descriptions import (
@@ -31,7 +32,6 @@ from ..descriptions import (
     schema_of,
     situation,
 )
-from ..recordings import digest_of
 
 Message = dict[str, Any]
 """A message between the page, the server and the game, or a part of one."""

@@ -15,9 +15,9 @@ from ...errors import (
     describe_error,
     did_you_mean,
 )
+from ...files.lines import Lines
 from ...simulation import Action, Model
 from ..descriptions import JSON, at_decision
-from ..recordings import Lines
 from .deciders import Deciders
 from .forms import Message, action_of, jsonable, pending_decision, words_of
 from .recording import Episode, follow, read

@@ -14,8 +14,9 @@ from ...errors import (
     UnknownPointError,
     short_repr,
 )
+from ...files.lines import Lines
+from ...files.values import digest_of
 from ...simulation import Action, Model, Observation
-from ..recordings import Lines, digest_of
 from .forms import Message, action_of
 
 

@@ -1,0 +1,386 @@
+"""Episodes as files: an environment is saved, and another process goes on from the same decision.
+
+A file has a line of JSON for the recipe of the environment, and one for each answer::
+
+    {"episode": 1, "view": "aec", "seed": 7, "simulation": {"name": "shop.Shop"}, ...}
+    {"agent": "buyer_0", "seen": "3f0b...", "action": 2}
+    {"agent": "seller_0", "seen": "91d2...", "mask": "77ac...", "action": 0, "by": "policy"}
+    {"exit": "buyer_0"}
+    {"agent": "buyer_1", "seen": "b60e..."}
+
+``seen`` and ``mask`` are digests of the observation and of the legal actions. The last line is the
+pending decision, the end, or the error of the model.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Unpack
+from uuid import uuid4
+
+from .core import (
+    GO_ON,
+    Model,
+    Plan,
+    Points,
+    Recording,
+    Replay,
+    Reseeded,
+    Session,
+    ViewOptions,
+    preserve_generators,
+    same,
+)
+from .envs import VIEWS
+from .envs.single import plan_of
+from .errors import (
+    EpisodeFileError,
+    SimEnvError,
+    StoreError,
+    ViewError,
+    close_after,
+    describe_error,
+    short_repr,
+)
+from .files.lines import Lines
+from .files.recipes import FORMAT, Json, arguments_of, changes_since, recipe_of
+from .files.tapes import FileTape, end_of, head_of, recorder, to_text
+from .files.values import decode_value
+from .simulation import Action, Sentinel
+
+_EXIT: Final = Sentinel("EXIT")
+"""Among answers: the ``None`` step of an agent that has ended."""
+
+
+def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = False) -> None:
+    """Write the episode of an environment to a file, from which ``load_episode`` goes on.
+
+    The file has the recipe of the environment by dotted names, the seed, and all answers, as lines
+    of JSON. To make digests of all observations, another simulation repeats the episode.
+
+    Args:
+        env: An environment of one simulation, in any view, with or without wrappers, which are not
+            written; also a clone. A decision is pending, or the episode has ended.
+        path: The file. An existing one is replaced.
+        unnamed: Whether to leave open whatever has no dotted name, such as a lambda. It must then
+            be given to ``load_episode``.
+
+    Raises:
+        EpisodeFileError: Something has no name, an action or an option is no data, or the
+            simulation does not repeat the episode. Nothing is written.
+        ViewError: It is not an environment of one simulation, or is one that a policy is given.
+        ResetNeededError: There is no episode.
+        BranchError: The episode has no complete tape.
+        StoreError: The file cannot be written.
+    """
+    view = getattr(env, "unwrapped", env)
+    if getattr(view, "kind", "") not in VIEWS:
+        raise ViewError(
+            f"save_episode needs an environment of one simulation, not {short_repr(env)}"
+        )
+    session = view.session
+    recording = session.recording()
+    if view.episode.pending is None and not view.episode.over:
+        raise session.refusal()
+    lines = [
+        head_of(recipe_of(session.plan, unnamed), view.kind, recording.seed, recording.options)
+    ]
+    file = getattr(getattr(session.episode, "tape", None), "path", None)
+    if file is not None and file.exists():  # with ``record=``
+        lines += [line for number, line in Lines(file).read() if number > 1]
+        if all(line.keys().isdisjoint(("end", "error")) for line in lines):
+            lines.append(end_of(view.episode))
+    else:
+        lines += _repeated(view, recording)
+    _write(Path(path), lines)
+
+
+def _repeated(view: Any, recording: Recording) -> list[Json]:
+    """Return the lines of an episode, which another simulation repeats."""
+    lines: list[Json] = []
+    session = Session(view.session.plan)
+    twin = VIEWS[view.kind].of_session(session)
+    replay = Replay(recording.tape)
+    session.make_tapes(partial(FileTape, put=lines.append), replay)
+    error = None
+    try:
+        with preserve_generators():  # because the model may draw from these
+            try:
+                _repeat(twin, recording.seed, recording.options, replay)
+                while view.kind == "aec" and twin.agents != view.agents:
+                    twin.step(None)
+            except Exception as problem:
+                error = problem
+            is_same = session.episode is not None and (
+                session.episode.outcome is view.episode.outcome
+                and same(session.recording().decision, recording.decision)
+            )
+            if replay or not is_same:
+                raise EpisodeFileError(
+                    f"{session.plan.name} does not repeat the episode with the same seed and"
+                    " the same actions, so that nothing could load the file. Some of its random"
+                    " numbers do not follow from the seed (try global_rng=True), or it depends on"
+                    " the order of a set, or its code has changed"
+                ) from error
+            lines.append(
+                end_of(view.episode) if error is None else {"error": describe_error(error)}
+            )
+    except BaseException as problem:
+        close_after(problem, twin.close, "the repeated episode")
+        raise
+    twin.close()
+    return lines
+
+
+def _repeat(view: Any, seed: int, options: Any, replay: Replay) -> None:
+    """Repeat the episode of a replay in a view."""
+    view.reset(seed=seed, options=options)
+    while replay and replay[0] is not GO_ON:
+        answer = replay.popleft()
+        if isinstance(answer, Reseeded):
+            view.session.reseed(answer.seed)
+        elif answer is _EXIT:
+            view.step(None)
+        else:
+            view.repeat(answer)
+
+
+def _write(path: Path, lines: list[Json]) -> None:
+    """Write lines to a file, which is never seen without some of them."""
+    text = "".join(f"{to_text(line)}\n" for line in lines)
+    beside = path.with_name(f"{path.name}.{uuid4().hex[:8]}")
+    try:
+        beside.write_bytes(text.encode(errors="surrogatepass"))
+        beside.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            beside.unlink()
+        raise StoreError(f"{path} cannot be written: {describe_error(error)}") from error
+
+
+# -- loading --------------------------------------------------------------------------------------
+
+
+def load_episode(
+    path: str | os.PathLike[str],
+    *,
+    simulation: Model = None,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
+) -> Any:
+    """Make an environment that stands where a saved or recorded episode stands.
+
+    Another simulation repeats the episode from its seed and its answers, and each observation and
+    mask is compared with the file. After an error of the model, the environment stands before the
+    user's last answer. A finished episode is loaded to its end.
+
+    Args:
+        path: The file of ``save_episode``, or of the option ``record``.
+        simulation: Takes the place of the simulation that the file names, or leaves open.
+        points: Take the place of the decision points that the file names.
+        **options: Take the place of options of the file, such as ``policies``.
+
+    Returns:
+        An environment of the same view. Its ``unwrapped.latest`` is what the last ``reset`` or
+        ``step`` has returned.
+
+    Raises:
+        EpisodeFileError: The file is malformed, or a name in it cannot be used; or a decision
+            differs: the first one, and the likely reason.
+        StoreError: The file cannot be read.
+        SimEnvError: Another argument is invalid.
+    """
+    return _Loading(Path(path)).load(simulation, points, options)
+
+
+def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> str:
+    """Repeat an episode, and return its timeline as text.
+
+    Args:
+        path: The file.
+        until: The number of decisions to repeat; those of policies that follow are repeated, too.
+            None: all.
+
+    Raises:
+        SimEnvError: Any error of ``load_episode``.
+    """
+    timeline: list[str] = []
+    loading = _Loading(Path(path), timeline)
+    if until is not None:
+        loading.stop_at(until)
+    view = loading.load(None, None, {})
+    head = f"{view.session.plan.name}, view {view.kind}, seed {view.session.seed}"
+    timeline.append(f"now: {_shown(end_of(view.episode))}")
+    view.close()
+    return "\n".join((head, *timeline))
+
+
+class _Loading:
+    """A file that is being loaded."""
+
+    def __init__(self, path: Path, timeline: list[str] | None = None) -> None:
+        """Read a file. ``timeline`` gets a text for each repeated decision."""
+        self._path = path
+        self._timeline = timeline
+        try:
+            lines = [*Lines(path).read()]
+        except OSError as error:
+            raise StoreError(f"{path} cannot be read: {describe_error(error)}") from error
+        except RecursionError:
+            raise self._malformed(1) from None
+        self._lines: list[Json] = []  # those of answers, without the actions
+        self._answers: list[Action] = []
+        self._last: Json = {}  # the line of the pending decision, of the end or of an error
+        number = 0
+        try:
+            for number, (place, line) in enumerate(lines, 1):
+                if number == 1:
+                    self._head = line | {"reset": decode_value(line.get("reset"))}
+                    self._view = VIEWS[line["view"]]
+                else:
+                    self._take(line)
+                if place != number:
+                    raise ValueError("there is a torn line before it")
+            if self._head["episode"] != FORMAT or not isinstance(self._head["versions"], dict):
+                raise ValueError("it is of another version")
+        except Exception as error:
+            raise self._malformed(number) from error
+        if "error" in self._last:
+            self._cut()
+
+    def _malformed(self, number: int) -> EpisodeFileError:
+        return EpisodeFileError(
+            f"line {number} of {self._path} is not what save_episode of this version writes"
+        )
+
+    def _take(self, line: Json) -> None:
+        """Take a line after the first one."""
+        if "reseed" in line:
+            answer: Action = Reseeded(line["reseed"])
+        elif "exit" in line:
+            answer = _EXIT
+        elif "action" in line and not self._last:
+            answer = decode_value(line.pop("action"))
+        elif line.keys() & {"agent", "end", "error"} and not self._last:
+            self._last = line
+            return
+        else:
+            raise ValueError("it is no line of an answer")
+        self._lines.append(line)
+        self._answers.append(answer)
+
+    def _cut(self) -> None:
+        """Leave out the user's last answer, and whatever follows it."""
+        self._last = {}
+        self.stop_at(max(self._places(), default=len(self._answers)))
+
+    def _places(self) -> list[int]:
+        """Return the places of the user's answers."""
+        lines = enumerate(self._lines[: len(self._answers)])
+        return [place for place, line in lines if "agent" in line and "by" not in line]
+
+    def stop_at(self, least: int) -> None:
+        """Leave out the user's next answer after so many answers, and whatever follows it."""
+        for place in self._places():
+            if place >= least:
+                self._last = self._lines[place]
+                del self._answers[place:]
+                return
+
+    def load(self, simulation: Model, points: Points, options: ViewOptions) -> Any:
+        """Make the environment."""
+        try:
+            arguments = arguments_of(self._head, simulation, points, dict(options))
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(error, SimEnvError):
+                raise
+            raise self._malformed(1) from error
+        plan = plan_of(*arguments)
+        view = self._view(plan)
+        try:
+            problem = self._replay(view)
+            if problem is not None:  # the process was killed before it could write that
+                self._cut()
+                problem = self._replay(view)
+            if problem is not None:
+                raise problem
+        except BaseException as error:
+            close_after(error, view.close, "the environment")
+            raise
+        return view
+
+    def _replay(self, view: Any) -> Exception | None:
+        """Bring the environment to the last line. Return the error of an answer at the very end."""
+        session = view.session
+        plan = session.plan
+        is_recorded = plan.options.record is not None
+        make_tape = recorder(plan, view.kind) if is_recorded else FileTape
+        expected = deque(self._lines[: len(self._answers)])
+
+        def differ(recorded: Json, line: Json) -> EpisodeFileError:
+            number = 2 + len(self._answers) - len(expected)
+            return self._difference(plan, number, recorded, line)
+
+        def compare(line: Json) -> None:
+            if expected and expected[0] != line:
+                raise differ(expected[0], line)
+            if expected and self._timeline is not None and "agent" in line:
+                agent = session.episode.latest
+                time = "" if agent.now is None else f"  at {agent.now:g}"
+                action = short_repr(self._answers[-len(expected)], 60)
+                by = ", by its policy" if "by" in line else ""
+                number = len(self._timeline) + 1
+                self._timeline.append(f"{number:6}{time}  {agent.name}: {action}{by}")
+            if expected:
+                expected.popleft()
+
+        def make(session: Session) -> FileTape:
+            tape = make_tape(session)
+            tape.compare(compare)
+            return tape
+
+        replay = Replay([*self._answers, GO_ON])
+        session.make_tapes(make, replay)
+        try:
+            _repeat(view, self._head["seed"], self._head["reset"], replay)
+        except EpisodeFileError:
+            raise
+        except Exception as error:
+            if not self._last and (not replay or replay[0] is GO_ON):
+                return error
+            recorded = expected[0] if expected else self._last
+            raise differ(recorded, {"error": describe_error(error)}) from error
+        finally:
+            session.make_tapes(make_tape if is_recorded else None)
+        view.episode.tape.compare(None)
+        line = end_of(view.episode)
+        if self._last and line != self._last:
+            raise differ(self._last, line)
+        return None
+
+    def _difference(self, plan: Plan, number: int, recorded: Json, line: Json) -> EpisodeFileError:
+        """Make the error for a line of the file, and the line that the environment has there."""
+        problem = f"it was {_shown(recorded)}, and is {_shown(line)}"
+        if _shown(recorded) == _shown(line):
+            names = {"seen": "the observation", "mask": "the mask of legal actions"}
+            differing = [text for key, text in names.items() if recorded.get(key) != line.get(key)]
+            problem = f"{' and '.join(differing) or 'the answerer'} of {_shown(line)} differs"
+        reasons = changes_since(self._head, plan) or [
+            "has the model changed? It may also iterate over a set of strings, draw from a global"
+            " generator (global_rng=True), or have been recorded with other floats of another"
+            " machine"
+        ]
+        return EpisodeFileError(
+            f"{self._path}, line {number}: the simulation does not repeat this decision: {problem}."
+            f" Likely reasons: {'; '.join(reasons)}"
+        )
+
+
+def _shown(line: Json) -> str:
+    """Return a line of a decision, an end or an error as words."""
+    decision = f"a decision of {line['agent']!r}" if "agent" in line else ""
+    return line.get("error") or decision or to_text(line)

@@ -95,6 +95,14 @@ def test_second_call_runs_only_new_seeds_and_contenders(tmp_path):
     assert len(begun) == 8
 
 
+def test_bar_begins_with_the_episodes_that_are_kept(tmp_path, capsys):
+    run(tmp_path)
+    run(tmp_path, seeds=range(6), progress=True)
+    shown = capsys.readouterr().err
+    assert " 12/18 [00:00<?, ?episode/s]" in shown  # and the rate is that of the others
+    assert " 18/18 " in shown
+
+
 def test_counts_of_policies_are_kept(tmp_path):
     def late(observation):
         raise ValueError
@@ -295,7 +303,7 @@ def test_kills_lose_no_finished_episode_and_count_none_twice(workers, tmp_path):
             is_early = chance.random() < 0.2
             while not is_early and files() == before and process.poll() is None:
                 time.sleep(0.001)
-            time.sleep(chance.uniform(0.0, 2.0 if is_early else 0.2 + 0.5 * workers))
+            time.sleep(chance.uniform(0.0, 2.0 if is_early else 0.8 + 0.3 * workers))
             process.kill()
             assert process.wait() == -signal.SIGKILL
             for group in groups[-2:] if number % 2 else groups[-2:-1]:

@@ -367,8 +367,7 @@ def evaluate(
     if store is not None:
         job, storage = open_store(lambda _: simulation, runner, store)
         agents = job.try_contenders(storage, [NO_FACTORS])
-        missing = storage.missing(_stored_runs(order), retry_errors=True)
-        done = len(order) - len(missing)
+        done = len(order) - len(storage.missing(_stored_runs(order), retry_errors=True))
         run_all = partial(_run_missing, job, storage, agents, workers)
     finished: list[Finished] = []
     start = 0

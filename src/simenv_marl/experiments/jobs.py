@@ -19,7 +19,7 @@ from uuid import uuid4
 
 from ..core import Plan, as_json, describe, reuse_resources
 from ..errors import SimEnvError, StoreError, describe_error
-from ..many.parallel import NO_BAR, spread
+from ..many.parallel import spread
 from ..simulation import Model
 from .runner import Result, Row, Runner, check_agents, error_note
 from .store import NO_FACTORS, Entry, Provenance, Run, Store, append, make_entry
@@ -127,11 +127,9 @@ class Job:
                     trials.append((names, list(group)))
             if trials:
                 with suppress(BrokenExecutor):  # a run that kills its worker does so again below
-                    spread(self.try_agents, (), trials, workers, 1, NO_BAR)
+                    spread(self.try_agents, (), trials, workers, 1, bar)
                 storage.read(self.session)
-                number = len(missing)
                 missing = [run for run in missing if run not in storage.runs]
-                bar.update(number - len(missing))
             self._run_all(missing, storage, workers, least, bar)
         storage.read()
 

@@ -249,7 +249,7 @@ def test_misnamed_agent_is_an_error_and_its_runs_are_not_kept(workers, tmp_path)
 SCRIPT = """
 import os, sys, time
 from simenv_marl import evaluate
-from tests.worlds.shops import POINTS, Shop, level, much, some
+from tests.worlds.shops import POINTS, Shop, level, some
 
 class Own(Shop):
     def reset(self, seed):
@@ -258,18 +258,31 @@ class Own(Shop):
             log.write(f"{seed}\\n")
 
     def run(self):
-        time.sleep(0.002)
+        time.sleep(0.002 + 0.004 * workers)
         super().run()
 
-store, workers = sys.argv[1], int(sys.argv[2])
+store, workers, seeds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+order, sell = POINTS.values()
+points = {Own.order: order, Own.sell: sell}
+
+def run(seeds, store, workers=0):
+    contenders = {"rule": {}, "some": {"keeper": some}}
+    given = {"points": points, "metric": level, "store": store, "workers": workers}
+    return evaluate(Own, contenders, seeds=range(seeds), **given).frame
+
 if __name__ == "__main__":
-    order, sell = POINTS.values()
-    found = evaluate(
-        Own, {"rule": {}, "some": {"keeper": some}}, seeds=range(int(sys.argv[3])),
-        points={Own.order: order, Own.sell: sell}, metric=level, store=store, workers=workers,
-    )
-    found.frame.to_pickle(f"{store}.table")
+    run(1, f"{store}.first")  # so that imports take no time of the others
+    os.remove(f"{store}.{os.getpid()}.log")
+    for _ in sys.stdin:
+        process = os.fork()
+        if not process:
+            os.setsid()
+            run(seeds, store, workers).to_pickle(f"{store}.table")
+            os._exit(0)
+        print(process, flush=True)
+        print(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
 """
+"""Forks a process for each line of its input, and prints its id and its exit code."""
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
@@ -277,45 +290,59 @@ if __name__ == "__main__":
 def test_kills_lose_no_finished_episode_and_count_none_twice(workers, tmp_path):
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(SCRIPT, encoding="utf-8")
-    seeds = 60 * KILLS
+    seeds = 60 * KILLS * (1 + workers)
     chance = random.Random(KILLS)
     path = os.pathsep.join([*filter(None, sys.path), str(ROOT)])
-    command = [sys.executable, script, store, str(workers), str(seeds)]
 
-    def files():
-        return len([*store.glob("runs-*")])
+    def logs():
+        return len([*tmp_path.glob("store.*.log")])
+
+    def answer():
+        return int(server.stdout.readline())
 
     def start():
-        environment = {**os.environ, "PYTHONPATH": path}
-        groups.append(subprocess.Popen(command, start_new_session=True, env=environment))
-        return groups[-1]
+        server.stdin.write(b"\n")
+        server.stdin.flush()
+        return answer()
 
-    def end_group(process):
+    def end_group(number):
         with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+            os.killpg(number, signal.SIGKILL)
 
-    kept, groups = set(), []
-    try:
-        for number in range(KILLS):
-            before = files()
-            process = start()
-            is_early = chance.random() < 0.2
-            while not is_early and files() == before and process.poll() is None:
-                time.sleep(0.001)
-            time.sleep(chance.uniform(0.0, 2.0 if is_early else 0.8 + 0.3 * workers))
-            process.kill()
-            assert process.wait() == -signal.SIGKILL
-            for group in groups[-2:] if number % 2 else groups[-2:-1]:
-                end_group(group)  # orphans may work beside the next call
-            known = set(keys(store))
-            assert kept <= known
-            kept = known
-        assert 0 < len(kept) < 2 * seeds
-        assert start().wait() == 0
-    finally:
-        for process in groups:
-            end_group(process)
+    kept, orphans = set(), []
+    with subprocess.Popen(
+        [sys.executable, script, store, str(workers), str(seeds)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as server:
+        try:
+            for _ in range(KILLS):
+                before = logs()
+                process = start()
+                while orphans:  # workers of the last call have gone on beside this one
+                    time.sleep(chance.uniform(0.0, 0.6))
+                    end_group(orphans.pop())
+                is_early = chance.random() < 0.2
+                deadline = time.monotonic() + 30.0
+                while not is_early and logs() == before and time.monotonic() < deadline:
+                    time.sleep(0.001)
+                time.sleep(chance.uniform(0.0, 0.2 + (0.6 if is_early else 0.1) * workers))
+                os.kill(process, signal.SIGKILL)
+                orphans.append(process)
+                if not workers or chance.random() < 0.5:
+                    end_group(orphans.pop())
+                assert answer() == -signal.SIGKILL
+                known = set(keys(store))
+                assert kept <= known
+                kept = known
+            assert 0 < len(kept) < 2 * seeds
+            start()
+            assert answer() == 0
+        finally:
+            while orphans:
+                end_group(orphans.pop())
+            server.stdin.close()
     found = pd.read_pickle(f"{store}.table")
     contenders = {"rule": {}, "some": {"keeper": some}}
     given = {"seeds": range(seeds), "points": POINTS, "metric": level}

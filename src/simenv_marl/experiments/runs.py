@@ -11,18 +11,8 @@ from functools import partial
 from itertools import product, starmap
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..core import (
-    EpisodeOptions,
-    Points,
-    portable,
-)
-from ..errors import (
-    OptionValueError,
-    SimulationError,
-    describe_error,
-    name_of,
-    short_repr,
-)
+from ..core import EpisodeOptions, Points, portable
+from ..errors import OptionValueError, SimulationError, describe_error, name_of, short_repr
 from ..many.parallel import import_extra, progress_bar
 from ..runs import check_options
 from ..simulation import Model
@@ -41,10 +31,7 @@ from .runner import (
     make_table,
     plain_value,
 )
-from .store import (
-    Run,
-    to_json,
-)
+from .store import Run, to_json
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -2,11 +2,14 @@
 
 import gc
 import os
+import re
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from functools import partial
 
 import joblib
 import pytest
@@ -20,9 +23,11 @@ from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.contract.test_simulate_many import ones
 from tests.processes import ROOT, alone, descriptors, python
+from tests.worlds import shops
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import calling, decision, define, script
+from tests.worlds.shops import Shop
 from tests.worlds.undone import fails
 
 # Where work is given up, joblib empties its queue of work while a thread of its own may be about to
@@ -402,3 +407,32 @@ def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
     tank, chosen, yard = [f"[[{log}], [{log}]]" for log in ("(1, 0, 0)", "(0, 1, 0)", "(0, 0, 1)")]
     expected = [tank] * 2 + [chosen] * 4 + [yard] * 2 + [chosen] * 2
     assert python(path).stdout.splitlines() == expected
+
+
+@pytest.mark.parametrize("backend", ["loky", "threading"])
+def test_bar_moves_with_each_episode_of_a_worker(backend, capsys):
+    def asked(observation, *, _decision):
+        return 5
+
+    shop = partial(Shop, kind="slow")
+    given = {"seeds": range(60), "points": shops.POINTS, "workers": 2, "progress": True}
+    with joblib.parallel_config(backend=backend):
+        collect_episodes(shop, {"keeper": asked}, **given)
+    numbers = list(map(int, re.findall(r" (\d+)/60 \[", capsys.readouterr().err)))
+    assert numbers == sorted(numbers)
+    assert len({*numbers}) > 4
+    assert numbers[-1] == 60
+
+
+def test_bar_counts_episodes_of_workers_that_cannot_reach_its_file(capsys, monkeypatch):
+    def update(bar, number=1):
+        if threading.current_thread() is threading.main_thread():
+            real(bar, number)
+        else:
+            bar.missing += number
+
+    real = parallel._SharedBar.update
+    monkeypatch.setattr(parallel._SharedBar, "update", update)
+    with joblib.parallel_config(backend="threading"):
+        simulate_many(Shop, seeds=range(8), workers=2, batch_size=2, progress=True)
+    assert "8/8" in capsys.readouterr().err

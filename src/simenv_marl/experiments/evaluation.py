@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
 from math import inf, nan, sqrt
+from os import PathLike
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from ..runs import check_options
 from ..simulation import Model, is_number
+from .jobs import Job, open_store
 from .plots import LOOKS, draw_dots, label_below
 from .runner import (
     FALLBACKS,
@@ -32,8 +34,10 @@ from .runner import (
     Team,
     check_agents,
     distinct_seeds,
+    error_note,
     make_table,
 )
+from .store import NO_FACTORS, Run, Store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -56,7 +60,7 @@ NO_COUNTS: Final = dict.fromkeys(("decisions", "asked", FALLBACKS, "seconds", "t
 """The columns of ``Evaluation.seats`` that are always there."""
 
 
-class Run(NamedTuple):
+class Finished(NamedTuple):
     """An episode of a contender, and its rows of the table."""
 
     contender: str
@@ -285,9 +289,14 @@ def evaluate(
     concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
+    store: str | PathLike[str] | None = None,
     **options: Unpack[EpisodeOptions],
 ) -> Evaluation:
     """Evaluate contenders on the same seeds.
+
+    With a ``store``, each episode is stored as soon as it is finished. An interrupt, an error or a
+    kill loses only the running episodes. The same call then runs the missing ones, also with other
+    seeds or more contenders.
 
     Args:
         simulation: As ``simulate_many`` takes it.
@@ -312,20 +321,24 @@ def evaluate(
         batch_size: As ``simulate_many`` takes it, if ``batched``.
         concurrency: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
-        progress: As ``simulate_many`` takes it.
+        progress: As ``simulate_many`` takes it. The bar shows the remaining time.
+        store: A folder that keeps finished episodes. It is created if it is missing. All workers
+            write to it. None: nothing is kept.
         **options: The options of ``simulate``.
 
     Returns:
         The evaluation.
 
     Raises:
-        OptionValueError: An argument has an invalid value. No simulation has run.
+        OptionValueError: An argument has an invalid value, or the store has other metrics or
+            belongs to an experiment. No simulation has run.
+        StoreError: The store cannot be read or written.
         AgentError: A contender names an agent that no episode had, and that ``possible_agents``
             does not declare.
         MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
         SimEnvError: Another argument does not work. The subclass and the message say which.
         BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``, with
-            notes that name the contender and the seed.
+            notes that name the contender and the seed, and the store.
     """
     import_extra("pandas", "evaluate")
     import_extra("scipy.stats", "evaluate")
@@ -349,15 +362,20 @@ def evaluate(
     # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
     order: dict[Any, int] = {run: place for place, run in enumerate(product(plans, all_seeds))}
-    finished: list[Run] = []
+    done = 0
+    run_all = partial(_run_all, simulation, runner, workers)
+    if store is not None:
+        job, storage = open_store(lambda _: simulation, runner, store)
+        agents = job.try_contenders(storage, [NO_FACTORS])
+        done = len(order) - len(storage.missing(_stored_runs(order), retry_errors=True))
+        run_all = partial(_run_missing, job, storage, agents, workers)
+    finished: list[Finished] = []
     start = 0
-    with progress_bar(len(order), progress, "episode") as bar:
+    with progress_bar(len(order), progress, "episode", done) as bar:
         for end in _checkpoints(len(all_seeds), width):
             runs = list(product(plans, all_seeds[start:end]))
             start = end
-            finished += chain(
-                *spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar)
-            )
+            finished += run_all(runs, bar)
             finished.sort(key=lambda run: order[run.contender, run.seed])
             rows = [row for run in finished for row in run.rows]
             columns = runner.columns
@@ -388,17 +406,50 @@ def _checkpoints(number: int, width: float | None) -> Iterator[int]:
     yield number
 
 
+def _run_all(
+    simulation: Model,
+    runner: Runner,
+    workers: int,
+    runs: Sequence[tuple[str, int]],
+    bar: Any,
+) -> Iterable[Finished]:
+    """Run pairs of contender and seed in workers."""
+    return chain(*spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar))
+
+
+def _run_missing(
+    job: Job,
+    storage: Store,
+    agents: dict[str, set[str]],
+    workers: int,
+    runs: Sequence[tuple[str, int]],
+    bar: Any,
+) -> Iterable[Finished]:
+    """Run pairs of contender and seed in workers, unless they are stored."""
+    missing = storage.missing(_stored_runs(runs), retry_errors=True)
+    job.run_missing(missing, agents, storage, workers, job.runner.batch_size, bar)
+    for run in _stored_runs(runs):
+        result = storage.runs.get(run, "its result is no longer stored")
+        with error_note(f"of the contender {run.contender!r}; seed {run.seed}"):
+            rows = job.runner.rows(run.contender, run.seed, result)
+        yield Finished(run.contender, run.seed, result, rows)
+
+
+def _stored_runs(runs: Iterable[tuple[str, int]]) -> list[Run]:
+    return [Run(NO_FACTORS, *run) for run in runs]
+
+
 def _run(
     simulation: Model,
     runner: Runner,
     runs: Sequence[tuple[str, int]],
     bar: Any,
-) -> list[Run]:
+) -> list[Finished]:
     """Run pairs of contender and seed."""
-    finished: list[Run] = []
+    finished: list[Finished] = []
 
     def report(name: str, seed: int, result: Result) -> None:
-        finished.append(Run(name, seed, result, runner.rows(name, seed, result)))
+        finished.append(Finished(name, seed, result, runner.rows(name, seed, result)))
         bar.update()
 
     with reuse_resources():
@@ -408,7 +459,7 @@ def _run(
     return finished
 
 
-def _seats_of(runs: Iterable[Run]) -> "DataFrame":
+def _seats_of(runs: Iterable[Finished]) -> "DataFrame":
     """Add up the decisions of each contender's agents, and all that their policies have counted."""
     from pandas import DataFrame
 

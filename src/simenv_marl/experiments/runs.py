@@ -4,75 +4,40 @@ Variants of a model.
 """
 
 import inspect
-import json
 import os
-import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor
-from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
-from itertools import groupby, product, starmap
-from pathlib import Path
-from time import time_ns
+from itertools import product, starmap
 from typing import TYPE_CHECKING, Any, Unpack
-from uuid import uuid4
 
-from ..core import (
-    EpisodeOptions,
-    Plan,
-    Points,
-    as_json,
-    describe,
-    portable,
-    reuse_resources,
-)
-from ..errors import (
-    OptionValueError,
-    SimEnvError,
-    SimulationError,
-    StoreError,
-    describe_error,
-    name_of,
-    short_repr,
-)
-from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
+from ..core import EpisodeOptions, Points, portable
+from ..errors import OptionValueError, SimulationError, describe_error, name_of, short_repr
+from ..many.parallel import import_extra, progress_bar
 from ..runs import check_options
 from ..simulation import Model
+from .jobs import open_store
 from .runner import (
     RESERVED,
     STATUS_COLUMNS,
     Contenders,
     Metrics,
-    Outcome,
     Result,
     Row,
     Runner,
     Team,
     Value,
-    check_agents,
     distinct_seeds,
     make_table,
     plain_value,
 )
-from .store import (
-    Entry,
-    Provenance,
-    Run,
-    Store,
-    append,
-    make_entry,
-    to_json,
-)
+from .store import Run, to_json
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 BY_RULE = "rule"
 """The contender that is always present: the model as it is."""
-
-DEATH = "WorkerError: the worker died in this run, twice; see retry_errors="
-"""The result of a run that has killed its worker."""
 
 
 def run_experiment(
@@ -163,32 +128,15 @@ def run_experiment(
             f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
             f" {problem}; make must be a callable of the factors, such as a class, or a Variant"
         )
-    folder = Path(store).absolute()  # other processes may have another working directory
-    storage = Store(folder, keys, rows[0], runner.metrics)
-    storage.read()
+    job, storage = open_store(partial(_source_of_row, make), runner, store, keys, rows[0])
     storage.check_rows()
-    session = f"{time_ns():016x}{uuid4().hex[:8]}"  # later sessions sort after it
-    job = Job(make, runner, folder, session)
     agents = job.try_contenders(storage, keys)
-    storage.create()
     # A row that occurs twice has the same results.
     runs = list(starmap(Run, product(dict.fromkeys(keys), contenders, all_seeds)))
-    final_results = Outcome if retry_errors else (Outcome, str)
-    missing = [run for run in runs if not isinstance(storage.runs.get(run), final_results)]
+    missing = storage.missing(runs, retry_errors=retry_errors)
+    least = len(all_seeds) if batched else 1
     with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar:
-        trials = []
-        for (_, contender), group in groupby(missing, lambda run: run[:2]):
-            names = agents.pop(contender, set()) - storage.agents[contender]
-            if names:
-                trials.append((names, list(group)))
-        if trials:
-            with suppress(BrokenExecutor):  # a run that kills its worker does so again below
-                spread(job.try_agents, (), trials, workers, 1, NO_BAR)
-            storage.read(session)
-            missing = [run for run in missing if run not in storage.runs]
-            bar.update(len(storage.runs))
-        job.run_all(missing, storage, workers, len(all_seeds) if batched else 1, bar)
-    storage.read()
+        job.run_missing(missing, agents, storage, workers, least, bar)
     return _make_frame(table, keys, all_seeds, storage.runs, runner)
 
 
@@ -242,158 +190,6 @@ def _source_of_row(make: "Callable[..., Model] | Variant", row: Mapping[str, Val
     if isinstance(make, Variant):
         return replace(make, parameters={**make.parameters, **row})
     return partial(make, **row) if isinstance(make, type) else make(**row)
-
-
-@dataclass(frozen=True)
-class Job:
-    """The work of an experiment, as its workers get it.
-
-    Attributes:
-        make: Makes the simulations of a row.
-        runner: Runs the episodes.
-        folder: The store.
-        session: The id of this call of ``run_experiment``, for the names of files.
-    """
-
-    make: "Callable[..., Model] | Variant"
-    runner: Runner
-    folder: Path
-    session: str
-
-    def prepare(self, row: str, contender: str) -> tuple[Plan, Provenance]:
-        """Return the plan of runs of a row with a contender, and their provenance."""
-        source = _source_of_row(self.make, json.loads(row))
-        plan = self.runner.plan(source, contender)
-        provenance = describe(plan, None)
-        provenance["policies"] |= as_json(self.runner.contenders[contender])
-        return plan, provenance
-
-    def try_contenders(self, storage: Store, rows: Sequence[str]) -> dict[str, set[str]]:
-        """Set up all contenders, and warn if they have changed since their runs were stored.
-
-        Returns:
-            The undeclared agents of each contender. It lacks a contender whose simulations cannot
-            be made in the first ten rows, because its runs tell why.
-        """
-        agents = {}
-        for contender in self.runner.contenders:
-            for row in [storage.samples.get(contender, rows[0]), *rows[:10]]:
-                try:
-                    plan, provenance = self.prepare(row, contender)
-                except SimEnvError:
-                    raise
-                except Exception:  # this row fails; another may not
-                    continue
-                storage.warn_of_changes(contender, row, provenance)
-                agents[contender] = self.runner.undeclared_agents(plan, contender)
-                break
-        return agents
-
-    def run_all(
-        self,
-        runs: Sequence[Run],
-        storage: Store,
-        workers: int,
-        least: int,
-        bar: Any,
-    ) -> None:
-        """Do runs in workers, in parts of at least ``least`` runs.
-
-        If a worker dies, joblib ends all others. Each half of the missing runs is then tried
-        separately. A single run that kills its worker twice becomes an error.
-
-        Raises:
-            BrokenExecutor: The workers have died before one of them began.
-        """
-        parts = [runs]
-        while parts:
-            part = parts.pop()
-            try:
-                # Small parts cost nothing.
-                spread(self.run_part, (), part, workers, least, bar, share=16)
-            except BrokenExecutor:
-                if not any(self.folder.glob(f"runs-{self.session}-*")):
-                    raise
-                if len(part) == 1 and part is not runs:
-                    append(self.folder, self.session, make_entry(part[0], DEATH, {}))
-                    continue
-                storage.read(self.session)
-                missing = [run for run in part if run not in storage.runs]
-                middle = len(missing) // 2
-                parts += [missing[middle:], missing[:middle]]
-
-    def run_part(self, runs: Sequence[Run], bar: Any) -> None:
-        """Do runs and store their results."""
-        append(self.folder, self.session)  # because this worker has begun
-        with reuse_resources():
-            for _, group in groupby(runs, lambda run: run[:2]):
-                self._run_group(list(group), partial(append, self.folder, self.session), bar)
-
-    def try_agents(
-        self,
-        trials: Sequence[tuple[set[str], list[Run]]],
-        bar: Any,
-    ) -> None:
-        """Run the first row of contenders until all agents that they name have decided.
-
-        Store the results only then.
-
-        Args:
-            trials: For each contender: the names of the agents, and the runs of its first row.
-            bar: The progress bar.
-
-        Raises:
-            AgentError: An agent has not decided.
-        """
-        for names, runs in trials:
-            entries: list[Entry] = []
-            present: dict[str, object] = {}
-            for run in runs:
-                self._run_group([run], entries.append, bar)
-                present |= entries[-1].get("agents", {})
-                if present.keys() >= names:
-                    break
-            if any(entry["status"] == "ok" for entry in entries):
-                check_agents(runs[0].contender, names, present)
-            append(self.folder, self.session, *entries)
-
-    def _run_group(
-        self,
-        runs: Sequence[Run],
-        write: Callable[[Entry], None],
-        bar: Any,
-    ) -> None:
-        """Do runs of one row and one contender, and ``write`` the result of each.
-
-        An error is a result, too.
-        """
-        row, contender, _ = runs[0]
-        remaining = {run.seed: run for run in runs}
-        number = len(runs)
-
-        def report(
-            seed: int,
-            result: Result,
-            trace: str | None = None,
-        ) -> None:
-            write(make_entry(remaining[seed], result, {**provenance, "seed": seed}, trace))
-            del remaining[seed]
-            bar.update()
-
-        while remaining:
-            seeds = list(remaining)[:number]
-            provenance: Provenance = {}  # unknown if the simulation cannot be made
-            try:
-                plan, provenance = self.prepare(row, contender)
-                self.runner.run(plan, contender, seeds, report)
-            except (KeyboardInterrupt, StoreError):
-                raise
-            except BaseException as error:
-                if self.runner.episodes_at_once(contender) > 1 and len(remaining) > 1 < number:
-                    number = 1  # running them one by one shows which of them failed
-                    continue
-                trace = "".join(traceback.format_exception(error))[-4000:]
-                report(next(iter(remaining)), describe_error(error), trace)
 
 
 # -- the table ------------------------------------------------------------------------------------

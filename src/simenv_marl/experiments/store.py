@@ -1,12 +1,12 @@
-"""The folder of an experiment: the result of each run is one line of JSON.
+"""The folder of an experiment or evaluation: the result of each run is one line of JSON.
 
 ::
 
     store/
-      experiment.json       the names of factors and metrics
+      experiment.json       the names of factors (null: an evaluation) and metrics
       runs-<id>-<id>.jsonl  the runs of one process, which alone appends to this file
 
-The first ids sort in the order of the sessions: calls of ``run_experiment``. A process writes a
+The first ids sort in the order of the sessions: calls of the function. A process writes a
 line at once and as a whole when a run is finished. If it is killed, it loses the runs it was
 working on; an unfinished line is the last one of its file and is ignored. There are no pickles.
 """
@@ -30,6 +30,9 @@ from .runner import Outcome, Result
 
 VERSION = 1
 HEADER = "experiment.json"
+
+NO_FACTORS = "{}"
+"""The row of an evaluation, which has no factors."""
 
 IRRELEVANT = ("seed", "packages", "dependencies")
 """The parts of the provenance that are not compared as they are. Each package is a part."""
@@ -74,7 +77,7 @@ def _explain_errors(problem: str) -> Iterator[None]:
 
 
 class Store:
-    """The folder of an experiment, and its contents as of the latest ``read``.
+    """The folder of an experiment or evaluation, and its contents as of the latest ``read``.
 
     Attributes:
         runs: The result of each run. If a run is stored more than once, a success counts, else the
@@ -88,17 +91,20 @@ class Store:
         self,
         folder: Path,
         rows: Iterable[str],
-        factors: Collection[str],
+        factors: Collection[str] | None,
         metrics: Iterable[str],
     ) -> None:
-        """Describe an experiment. ``rows`` are the rows of the design, as JSON."""
+        """Describe an experiment, or without ``factors`` an evaluation.
+
+        ``rows`` are the rows of the design, as JSON.
+        """
         self.folder = folder
         self._rows = dict.fromkeys(rows)
-        self._factors = factors
+        self._factors = factors or ()
         self._path = folder / HEADER
         self._header = {
             "simenv_marl": VERSION,
-            "factors": sorted(factors),
+            "factors": None if factors is None else sorted(factors),
             "metrics": sorted(metrics),
         }
         self._unusable = f"{folder} cannot be made or read as the folder of an experiment"
@@ -146,6 +152,7 @@ class Store:
                 if any(not name.startswith((HEADER, ".")) for name in names):
                     raise OptionValueError(
                         f"the folder {self.folder} is not empty, and not the store of an experiment"
+                        " or evaluation"
                     )
                 return
             text = self._path.read_bytes()
@@ -158,8 +165,8 @@ class Store:
         for part, expected in self._header.items():
             if content.get(part) != expected:
                 raise OptionValueError(
-                    f"the store {self.folder} belongs to another experiment: its {part} are"
-                    f" {content.get(part)}, not {expected}; pass another folder"
+                    f"the store {self.folder} belongs to another experiment or evaluation: its"
+                    f" {part} are {content.get(part)}, not {expected}; pass another folder"
                 )
 
     def _add(self, entry: Entry) -> None:
@@ -168,13 +175,19 @@ class Store:
         run = Run(row, entry["contender"], entry["seed"])
         result: Result = entry["error"]
         if entry["status"] == "ok":
-            result = Outcome(entry["agents"], entry["metrics"], entry.get("team"))
+            numbers = entry["agents"], entry["metrics"], entry.get("team")
+            result = Outcome(*numbers, entry.get("counts", {}))
             if row in self._rows and run.contender not in self.samples:
                 self._parts[run.contender] = _comparable_parts(entry["provenance"])
                 self.samples[run.contender] = row
             self.agents[run.contender].update(result.agents)
         if not isinstance(self.runs.get(run), Outcome):
             self.runs[run] = result
+
+    def missing(self, runs: Iterable[Run], *, retry_errors: bool) -> list[Run]:
+        """Return the runs that are not stored, and those with errors if they are to be retried."""
+        final = Outcome if retry_errors else (Outcome, str)
+        return [run for run in runs if not isinstance(self.runs.get(run), final)]
 
     # -- changes since the runs were stored -------------------------------------------------------
 

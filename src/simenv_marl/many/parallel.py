@@ -10,12 +10,14 @@ import multiprocessing
 import os
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from math import ceil, inf
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
+from tempfile import mkstemp
+from threading import Event, Thread
 from time import monotonic
 from typing import Any, Final, TypeVar
 
@@ -109,6 +111,59 @@ def progress_bar(
     return tqdm(total=total, unit=unit, initial=done)
 
 
+class _SharedBar(ProgressBar):
+    """The bar of a worker, which writes a byte for each unit to a file of the parent.
+
+    Attributes:
+        missing: The number of units that it could not write, as on another machine.
+    """
+
+    missing = 0
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def update(self, number: int = 1) -> None:
+        """Move the bar."""
+        try:
+            file = os.open(self._path, os.O_WRONLY | os.O_APPEND)
+        except OSError:
+            self.missing += number
+        else:
+            os.write(file, bytes(number))
+            os.close(file)
+
+
+@contextmanager
+def _shared(bar: ProgressBar) -> Iterator[str]:
+    """Move a bar by the size of a file, whose path is for a ``_SharedBar``. No bar: no file."""
+    if bar is NO_BAR:
+        yield ""
+        return
+    ended = Event()
+    file, path = mkstemp()  # Windows lets workers open it
+
+    def watch() -> None:
+        number = 0
+        is_over = False
+        while not is_over:
+            is_over = ended.wait(0.2)
+            size = os.fstat(file).st_size
+            if size > number:  # tqdm measures the time since its last update
+                bar.update(size - number)
+            number = size
+
+    thread = Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield path
+    finally:
+        ended.set()
+        thread.join()
+        os.close(file)
+        os.remove(path)
+
+
 # -- processes of joblib --------------------------------------------------------------------------
 
 
@@ -148,39 +203,41 @@ def spread(
     # Outcomes are packed in the worker, because each backend passes errors on in its own way.
     parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
     call = joblib.delayed(pack_outcome)
-    outcomes = parallel(call(_work, parcel, os.getpid(), part) for part in parts)
     results: list[Result] = []
-    try:
-        for part, outcome in zip(parts, outcomes, strict=True):
-            returned, error = unpack_outcome(outcome)
-            if error is not None:
-                raise error
-            result, counts = returned
-            results.append(result)
-            for token, numbers in counts.items():
-                count(token, **numbers)
-            bar.update(len(part))
-    finally:
-        if form == "generator":
-            with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
-                outcomes.close()  # cancels the remaining work
+    with _shared(bar) as path:
+        outcomes = parallel(call(_work, parcel, os.getpid(), path, part) for part in parts)
+        try:
+            for _, outcome in zip(parts, outcomes, strict=True):
+                returned, error = unpack_outcome(outcome)
+                if error is not None:
+                    raise error
+                result, counts, missing = returned
+                results.append(result)
+                for token, numbers in counts.items():
+                    count(token, **numbers)
+                _SharedBar(path).update(missing)
+        finally:
+            if form == "generator":
+                with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
+                    outcomes.close()  # cancels the remaining work
     return results
 
 
 def _work(
-    parcel: bytes, home: int, items: Sequence[object]
-) -> tuple[object, dict[str, dict[str, float]]]:
-    """Work on a part of the items, in a worker.
+    parcel: bytes, home: int, path: str, items: Sequence[object]
+) -> tuple[object, dict[str, dict[str, float]], int]:
+    """Work on a part of the items, in a worker. ``path`` is for its ``_SharedBar``.
 
     Returns:
-        The result, and the counts of policies. In the process ``home``, no counts, because they
-        are in its ``COUNTS`` already.
+        The result; the counts of policies; and the number of units that the bar misses. In the
+        process ``home``, no counts, because they are in its ``COUNTS`` already.
     """
     is_away = os.getpid() != home
     if is_away:
         COUNTS.clear()
     work, arguments = unpack(parcel)
-    return work(*arguments, items, NO_BAR), COUNTS if is_away else {}
+    bar = _SharedBar(path)
+    return work(*arguments, items, bar), COUNTS if is_away else {}, bar.missing
 
 
 # -- processes of a pool --------------------------------------------------------------------------

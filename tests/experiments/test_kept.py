@@ -21,6 +21,7 @@ from simenv_marl.seats import FallbackPolicy
 from tests.experiments.test_runs import ROOT, lines, visits
 from tests.experiments.test_wrong_numbers import BET, Casino
 from tests.worlds.many_worlds import beings
+from tests.worlds.models import plainly
 from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 KILLS = int(os.environ.get("KEPT_KILLS", "3"))
@@ -68,7 +69,7 @@ def end_at(seed, error=KeyboardInterrupt):
 @pytest.mark.parametrize(
     "arguments",
     [{}, {"workers": 2}, MANY, MANY | {"batch_size": 2}, MANY | {"workers": 2}, {"width": 50.0}],
-    ids=str,
+    ids=plainly,
 )
 def test_kept_evaluation_equals_a_plain_one(arguments, tmp_path, capsys):
     arguments = {"seeds": range(20)} | arguments
@@ -115,7 +116,7 @@ def test_counts_of_policies_are_kept(tmp_path):
     assert kept[1].seats["seconds"].gt(0).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, MANY | {"batch_size": 1}], ids=str)
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, MANY | {"batch_size": 1}], ids=plainly)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, TimeoutError])
 def test_interrupts_and_errors_keep_what_is_finished(error, arguments, tmp_path):
     if error is KeyboardInterrupt and "workers" in arguments:

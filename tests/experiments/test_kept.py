@@ -212,12 +212,15 @@ def test_equal_definitions_are_not_warned_of(tmp_path):
 
 
 def test_runs_with_wrong_numbers_are_run_again(tmp_path):
+    class Fresh(Casino):
+        """One of which nobody was warned yet."""
+
     given = {"seeds": range(2), "points": BET, "store": tmp_path}
     with pytest.warns(UserWarning, match="global"):
-        assert set(evaluate(Casino, {"rule": {}}, **given).frame["status"]) == {"error"}
-    mended = evaluate(Casino, {"rule": {}}, global_rng=True, **given)
+        assert set(evaluate(Fresh, {"rule": {}}, **given).frame["status"]) == {"error"}
+    mended = evaluate(Fresh, {"rule": {}}, global_rng=True, **given)
     assert "status" not in mended.frame
-    assert mended.frame.equals(evaluate(Casino, {"rule": {}}, **given, global_rng=True).frame)
+    assert mended.frame.equals(evaluate(Fresh, {"rule": {}}, **given, global_rng=True).frame)
     assert len(keys(tmp_path)) == 4
 
 

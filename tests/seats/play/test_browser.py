@@ -249,7 +249,7 @@ def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, s
     server = start("--seed", "3", "--limit", "300")
     buyer, seller = open_page(server, "buyer"), open_page(server, "seller")
     wait_for_turn(buyer)
-    assert buyer.locator(".card kbd").all_inner_texts() == ["0", "1", "2", "3", "b"]
+    assert buyer.locator(".card kbd").all_inner_texts() == ["0", "1", "2", "3", "r"]
     assert buyer.locator("#decide").is_disabled()
     buyer.keyboard.press("2")
     assert buyer.locator(".card[aria-checked=true]").count() == 1

@@ -20,10 +20,9 @@ from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel
 from .player import Environment, Player, Policies
 
 
-class JointPlayer(Player):
-    """The one agent of a joint view. Its action holds the actions of all agents of the roster."""
+class UnitedPlayer(Player):
+    """The one learner of a view that unites all agents."""
 
-    view: SimulationJointEnv
     sees_rewards = False
 
     def __init__(
@@ -32,6 +31,34 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
+
+    @property
+    def number(self) -> int:
+        """The number of its steps."""
+        return self.episode.turns
+
+    def _decide_by(self, policies: Policies) -> Action:
+        """Return the learner's action, by its policy or those of the agents."""
+        if self.name in policies:
+            return super()._decide_by(policies)
+        return self._unite(policies)
+
+    def _unite(self, policies: Policies) -> Action:
+        """Return the learner's action by policies of the agents."""
+        raise NotImplementedError
+
+
+class JointPlayer(UnitedPlayer):
+    """The one agent of a joint view. Its action holds the actions of all agents of the roster."""
+
+    view: SimulationJointEnv
+
+    def __init__(
+        self,
+        env: Environment,
+        base: Policy,
+    ) -> None:
+        super().__init__(env, base)
         observation = self.view.joint.read(self.episode)[0]
         self.latest = {self.name: (observation, {})}
         space = self.view.action_space
@@ -41,11 +68,6 @@ class JointPlayer(Player):
                 "a base by agent needs a joint view without flatten=True; pass one policy for all"
                 " agents"
             )
-
-    @property
-    def number(self) -> int:
-        """The number of rounds that were played."""
-        return self.episode.turns
 
     def _learns(self, policies: Policies) -> TypeGuard[dict[Sentinel, JointPolicy]]:
         """Return whether policies are those of a learner of this view."""
@@ -66,13 +88,10 @@ class JointPlayer(Player):
                 action = {**action, **samples}
             super()._check(action, mask)
 
-    def _decide_by(self, policies: Policies) -> Action:
-        """Return the actions of all agents by some policies."""
+    def _unite(self, policies: Policies) -> Action:
         if self._learns(policies):
             pending = self.episode.pending or self.agent
             return policies[EVERYONE].answer_all(self.episode, pending)
-        if self.name in policies:
-            return super()._decide_by(policies)
         agents = self.episode.agents
         return {
             name: self._decide_for(name, policies) if name in agents else RULE
@@ -80,18 +99,17 @@ class JointPlayer(Player):
         }
 
 
-class TurnPlayer(Player):
+class TurnPlayer(UnitedPlayer):
     """The learner of a turn view, which decides for each agent. ``agent`` decides now."""
 
     view: SimulationTurnEnv
-    sees_rewards = False
 
     def __init__(
         self,
         env: Environment,
         base: Policy,
     ) -> None:
-        super().__init__(env, base, "all agents")
+        super().__init__(env, base)
         info: Info = {"agent": self.agent.name}
         if self.mask is not None:
             info[MASK] = self.mask
@@ -101,11 +119,6 @@ class TurnPlayer(Player):
                 "a base by agent needs a turn view whose action space no wrapper has replaced; pass"
                 " one policy for all agents"
             )
-
-    @property
-    def number(self) -> int:
-        """The number of turns."""
-        return self.episode.turns
 
     @property
     def mask(self) -> Mask | None:
@@ -131,10 +144,7 @@ class TurnPlayer(Player):
         self.agent = self.view.own_agent
         return reward
 
-    def _decide_by(self, policies: Policies) -> Action:
-        """Return the learner's action by some policies."""
-        if self.name in policies:
-            return super()._decide_by(policies)
+    def _unite(self, policies: Policies) -> Action:
         action = self._decide_for(self.agent.name, policies)
         if action is not RULE:
             code = self.view.turn.seats[self.agent.point.hook].code

@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Mapping
 from math import isfinite
-from numbers import Real
 from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
@@ -43,7 +42,7 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
-from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel, asks_for
+from ..simulation import EVERYONE, RULE, Action, Observation, Sentinel, asks_for, is_number
 from .candidates import Candidate, First, Metric, Propose, is_policy
 
 Environment: TypeAlias = (
@@ -422,11 +421,11 @@ def number_of(value: Any, name: str) -> float:
     """Return a finite number that a callable has returned. ``name``: its option."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
-    if not is_number(value):
+    if not is_finite(value):
         raise OptionValueError(f"{name} must return a finite number, not {short_repr(value)}")
     return float(value)
 
 
-def is_number(value: object) -> TypeGuard[float]:
+def is_finite(value: object) -> TypeGuard[float]:
     """Return whether a value is one finite number."""
-    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+    return is_number(value) and isfinite(value)

@@ -21,7 +21,7 @@ from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
 from .candidates import Candidate, Choice, Course, First, Metric, Propose, Task, is_policy
-from .player import Environment, Player, is_number
+from .player import Environment, Player, is_finite
 from .players import player_of
 from .rollout import Indices, Rollout, Try, try_out
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
@@ -40,12 +40,12 @@ def is_count(value: object) -> TypeGuard[int]:
 
 def is_positive(value: object) -> TypeGuard[float]:
     """Return whether a value is a positive number."""
-    return is_number(value) and value > 0
+    return is_finite(value) and value > 0
 
 
 def is_weight(value: object) -> TypeGuard[float]:
     """Return whether a value is a number that is not negative."""
-    return is_number(value) and value >= 0
+    return is_finite(value) and value >= 0
 
 
 _UNITS: Final = ("decision", "time")

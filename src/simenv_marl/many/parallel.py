@@ -82,7 +82,13 @@ def import_extra(module: str, feature: str) -> Any:
 
 
 class ProgressBar:
-    """A progress bar that shows nothing."""
+    """A progress bar that shows nothing.
+
+    Attributes:
+        missing: The number of units by which it has not moved, although it should have.
+    """
+
+    missing = 0
 
     def update(self, number: int = 1) -> None:
         """Move the bar."""
@@ -114,11 +120,8 @@ def progress_bar(
 class _SharedBar(ProgressBar):
     """The bar of a worker, which writes a byte for each unit to a file of the parent.
 
-    Attributes:
-        missing: The number of units that it could not write, as on another machine.
+    On another machine there is no such file, and units are missing.
     """
-
-    missing = 0
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -215,7 +218,8 @@ def spread(
                 results.append(result)
                 for token, numbers in counts.items():
                     count(token, **numbers)
-                _SharedBar(path).update(missing)
+                if missing:
+                    _SharedBar(path).update(missing)
         finally:
             if form == "generator":
                 with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
@@ -236,7 +240,7 @@ def _work(
     if is_away:
         COUNTS.clear()
     work, arguments = unpack(parcel)
-    bar = _SharedBar(path)
+    bar = _SharedBar(path) if path else NO_BAR
     return work(*arguments, items, bar), COUNTS if is_away else {}, bar.missing
 
 

@@ -10,11 +10,9 @@ from typing import Any
 class Lines:
     """A file with a line of JSON for each value. It is open only while it is read or written."""
 
-    def __init__(self, path: str | os.PathLike[str], *, shared: bool = True) -> None:
-        """Name the file. The first line creates it. ``shared``: whether others may write it."""
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Name the file. The first line creates it."""
         self.path = Path(path)
-        self._is_shared = shared
-        self._may_be_torn = True
 
     def read(self) -> Iterator[tuple[int, Any]]:
         """Yield the numbers of the lines, from 1, and their values.
@@ -35,10 +33,8 @@ class Lines:
         """
         lines = [json.dumps(value, ensure_ascii=False) for value in values]
         text = "".join(f"{line}\n" for line in lines).encode()
-        may_be_torn, self._may_be_torn = self._may_be_torn, True  # until all is written
         with open(self.path, "ab+", buffering=0) as file:
-            if (may_be_torn or self._is_shared) and file.tell():
+            if file.tell():
                 file.seek(-1, os.SEEK_END)
                 text = text if file.read(1) == b"\n" else b"\n" + text
             file.write(text)
-        self._may_be_torn = False

@@ -35,7 +35,7 @@ from ..envs.base import View
 from ..errors import OptionValueError, short_repr, warn_user
 from ..many.batch import policy_keys
 from ..many.parallel import import_extra
-from ..simulation import EVERYONE, RULE, Model, check_count, is_number
+from ..simulation import EVERYONE, RULE, Model, check_count, is_deterministic, is_number
 from .plots import LOOKS
 from .runner import distinct_seeds, error_note, make_table
 
@@ -422,7 +422,7 @@ class _Copies:
                 closing(Session(plan)) as session,
             ):
                 episode: Any = session.start(seed, None)
-                if getattr(episode.simulation, "deterministic", False) is True:
+                if is_deterministic(episode.simulation):
                     self.futures = None
                 stand = _Stand.of_session(session)
                 stand.earned = _paid(episode)

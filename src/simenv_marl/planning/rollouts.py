@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..core import Info, Policy, branch, checked_seed, is_seed, same
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
-from ..simulation import RULE, Action, Observation
+from ..simulation import RULE, Action, Observation, is_deterministic
 from .candidates import Candidate, Choice, Course, First, Metric, Propose, Task, is_policy
 from .player import Environment, Player, is_finite
 from .players import player_of
@@ -388,8 +388,7 @@ class Rollouts:
 
 
 def _is_deterministic(view: Any) -> bool:
-    """Return whether a simulation says that it has no chance."""
-    return getattr(view.episode.simulation, "deterministic", False) is True
+    return is_deterministic(view.episode.simulation)
 
 
 def _is_same(one: Candidate, other: Candidate) -> bool:

@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, aec_env, simulate
+from simenv_marl import RULE, aec_env, make_step, simulate
 from simenv_marl.data import joint_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
@@ -482,6 +482,50 @@ def test_futures_of_all_answers_have_the_same_duration(make_host):
     host.handle("machine", {"do": "horizon", "n": 2.5, "by": "time"})
     for candidate in think(host)["candidates"]:
         assert [row[-1] for row in candidate["bands"][0]] == pytest.approx([-2.5] * 3)
+
+
+class Till:
+    """Six answers, which are the rewards. Every third must not be 2. The rule answers 0."""
+
+    def reset(self, seed=None):
+        self.day, self.taken = 0, 0
+
+    def run(self):
+        for self.day in range(6):
+            self.taken = self.take()
+
+    @make_step(
+        observation_space=spaces.Box(0, 6, (1,)),
+        observation_space_mapping=lambda till: [till.day],
+        action_space=spaces.Discrete(3),
+        action_space_mapping=int,
+        action_mask_mapping=lambda till: [1, 1, till.day != 2],
+        reward_mapping=lambda till: till.taken,
+        agent="clerk",
+    )
+    def take(self):
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("hold", "points"), [({}, 2), ({"hold": 2}, 4), ({"hold": 4}, 6), ({"hold": None}, 8)]
+)
+def test_futures_hold_answers_where_they_are_legal(make_host, hold, points):
+    host = make_host(Till, seats=("clerk",))
+    settle(host)
+    host.handle("clerk", {"do": "horizon", "n": 5, **hold})
+    fan = think(host)
+    assert fan["hold"] == hold.get("hold", 1)
+    candidate = next(one for one in fan["candidates"] if one["action"] == 2)
+    assert [row[-1] for row in candidate["bands"][0]] == [points] * 3
+
+
+@pytest.mark.parametrize("hold", [0, 101, 1.5, True, "2"])
+def test_futures_refuse_a_wrong_hold(make_host, hold):
+    host = make_host(Till, seats=("clerk",))
+    settle(host)
+    with pytest.raises(OptionValueError, match="hold must be"):
+        host.handle("clerk", {"do": "horizon", "n": 5, "hold": hold})
 
 
 def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):

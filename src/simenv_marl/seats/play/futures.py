@@ -2,9 +2,10 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import repeat
 from math import floor, log10
 from threading import Lock, Thread
 from typing import Any, Final, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 from ... import clone
 from ...core import Info
 from ...envs import SimulationAECEnv
-from ...errors import BranchError, describe_error
+from ...errors import BranchError, InvalidActionError, describe_error
 from ...simulation import Action
 from ..descriptions import at_decision, labelled
 from .forms import (
@@ -124,20 +125,35 @@ class Exploration:
                 os.kill(self._process, signal.SIGKILL)
                 self._process = None
 
-    def _follow(self, twin: SimulationAECEnv) -> Iterator[tuple[str, float, bool, Info]]:
+    def _follow(
+        self, twin: SimulationAECEnv, own: str = "", held: Iterable[Action] = ()
+    ) -> Iterator[tuple[str, float, bool, Info]]:
         """Go on in a clone, by policies and the rule.
+
+        Args:
+            twin: The clone.
+            own: An agent that first takes actions of its own.
+            held: These actions, as JSON. Policies and the rule answer for illegal ones.
 
         Yields:
             Each agent that decides or has ended: its name, the reward of its previous decision,
             whether it has ended, and its info.
         """
+        actions = iter(held)
         while twin.agents:
             agent = twin.agent_selection
+            space = twin.action_space(agent)
             _, reward, terminated, truncated, info = twin.last(observe=False)
             ended = terminated or truncated
             yield agent, reward, ended, info
-            answer = None if ended else self._deciders.answer(twin, future=True)
-            twin.step(None if ended else action_of(twin.action_space(agent), answer))
+            if ended:
+                twin.step(None)
+                continue
+            if agent == own and (action := next(actions, None)) is not None:
+                with suppress(InvalidActionError):
+                    twin.step(action_of(space, action))
+                    continue
+            twin.step(action_of(space, self._deciders.answer(twin, future=True)))
 
 
 # -- the candidates for a decision ----------------------------------------------------------------
@@ -158,10 +174,13 @@ class Horizon:
         by_time: Whether it is a time, else a number of the agent's decisions.
         length: The time or the number. None: the time of the first future's ``DECISIONS``
             decisions.
+        hold: The number of the agent's decisions that a candidate answers, where it is legal. None:
+            all of them.
     """
 
     by_time: bool = True
     length: float | None = None
+    hold: int | None = 1
 
     def learn(self, span: float) -> None:
         """Take the time of a future, rounded down to one digit."""
@@ -206,7 +225,7 @@ class Futures(Exploration):
         self.pending = pending
         self.note = ""
         has_time = pending["time"] is not None or not horizon.by_time
-        self._horizon = horizon if has_time else Horizon(by_time=False)
+        self._horizon = horizon if has_time else Horizon(by_time=False, hold=horizon.hold)
         self._start: float = pending["time"] if self._horizon.by_time else 0.0
         self._seed = game.seed * 1_000_003 + pending["number"] * 1009
         self._space = env.action_space(pending["agent"])
@@ -258,7 +277,9 @@ class Futures(Exploration):
         try:
             with self._twin(seed) as twin:
                 twin.step(action_of(self._space, candidate.action))
-                for agent, reward, ended, info in self._follow(twin):
+                hold = self._horizon.hold or MOST_DECISIONS
+                held = repeat(candidate.action, hold - 1)
+                for agent, reward, ended, info in self._follow(twin, own, held):
                     time, total, *numbers = course[-1]
                     if agent == own:
                         time = info.get("time", time) if self._horizon.by_time else time + 1
@@ -320,6 +341,7 @@ class Futures(Exploration):
             "moment": self.moment,
             "horizon": length,
             "by_time": by_time,
+            "hold": self._horizon.hold,
             "measures": ["your points", *labels],
             "candidates": candidates,
             "done": is_over,

@@ -259,7 +259,11 @@ class Host:
             case {"do": "horizon", "n": int() | float() as length} if 0 < length <= 1e9:
                 by_time = message.get("by") == "time"
                 self.abandon()
-                self._horizon = Horizon(by_time, length if by_time else min(int(length), 100))
+                hold = message.get("hold", 1)
+                if hold is not None and not (type(hold) is int and 1 <= hold <= 100):
+                    raise OptionValueError(f"hold must be 1 to 100 or null, not {short_repr(hold)}")
+                length = length if by_time else min(int(length), 100)
+                self._horizon = Horizon(by_time, length, hold)
                 self.exploring = None
             case _:
                 raise OptionValueError(f"the game cannot follow {short_repr(message)}")

@@ -90,11 +90,14 @@ $("yes").onclick = () => {
 $("jump").oninput = () => { $("turn").textContent = `${Math.min(number("jump") + 1, page.state.length)} of ${page.state.length}`; };
 $("jump").onchange = () => moved({ do: "jump", n: number("jump") });
 $("of").onchange = redraw;
-for (const id of ["horizon", "by"]) $(id).onchange = () => {
+for (const id of ["horizon", "by", "hold"]) $(id).onchange = () => {
   const by = $("by").value, length = Number($("horizon").value);
+  const hold = $("hold").value.trim() ? Number($("hold").value) : null;
+  const holds = !$("hold").validity.badInput && (hold === null || (Number.isInteger(hold) && hold >= 1 && hold <= 100));
   const fits = length > 0 && (by === "time" || (Number.isInteger(length) && length <= 100));
-  wrong(fits ? "" : by === "time" ? "Enter a number above 0." : "Enter a whole number of decisions from 1 to 100.");
-  if (fits) send({ do: "horizon", by, n: length });
+  const whole = "Enter a whole number of decisions from 1 to 100";
+  wrong(!fits ? (by === "time" ? "Enter a number above 0." : `${whole}.`) : holds ? "" : `${whole}, or nothing for all of them.`);
+  if (fits && holds) send({ do: "horizon", by, n: length, hold });
 };
 $("seats").onclick = ({ target }) => { if (target.dataset.seat !== undefined) send({ do: "claim", seat: target.dataset.seat }); };
 

@@ -214,6 +214,7 @@ export function drawMeasures() {
   if (!same(options, fan.measures)) $("of").replaceChildren(...fan.measures.map((one) => make("option", {}, one)));
   if (document.activeElement !== $("horizon")) $("horizon").value = fan.horizon ?? "";
   if (document.activeElement !== $("by")) $("by").value = fan.by_time ? "time" : "decisions";
+  if (document.activeElement !== $("hold")) $("hold").value = fan.hold ?? "";
   $("by").disabled = page.state?.pending?.time === null;
 }
 

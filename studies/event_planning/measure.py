@@ -76,7 +76,10 @@ def compare(
     ]
     error = float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
     return Row(
-        (name, futures, unit), float(np.mean(gains)), error, planner.rule / planner.decisions
+        (name, futures, unit),
+        float(np.mean(gains)),
+        error,
+        planner.rule / max(1, planner.decisions),
     )
 
 

@@ -1,4 +1,4 @@
-"""Three event-driven models: factories with one generator or one per machine, a queue network."""
+"""Event-driven models: factories with one generator or one per machine, queues, a hospital."""
 
 from __future__ import annotations
 
@@ -25,6 +25,15 @@ STATIONS: Final = (0.8, 0.9)
 
 REFUSAL: Final = 6.0
 """The costs of a job that is refused."""
+
+DOCTORS: Final = (1.6, 2.4)
+"""The mean times of a treatment, by doctor."""
+
+COSTS: Final = (1, 4)
+"""The costs of a patient in a unit of time: of others, and of urgent ones."""
+
+URGENT: Final = 0.3
+"""The probability that a patient is urgent."""
 
 MOST: Final = 10
 """The network's rule admits a job as long as there are fewer jobs than this."""
@@ -170,8 +179,53 @@ class Network(Work):
         self.change(-1)
 
 
+class Hospital(Work):
+    """Two doctors, and patients of whom some are urgent: their time there costs more.
+
+    The rule treats those first who came first.
+    """
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode."""
+        super().reset(seed)
+        self.waiting: list[int] = []
+        self.free = len(DOCTORS) * [True]
+
+    def arrive(self) -> None:
+        """Treat a patient who has arrived."""
+        is_urgent = self.streams["patients"].random() < URGENT
+        self.waiting.append(COSTS[is_urgent])
+        self.change(self.waiting[-1])
+        for doctor, is_free in enumerate(self.free):
+            if is_free and self.waiting:
+                self.sim.process(self.treat(doctor))
+
+    @make_step(
+        observation_space=spaces.Box(0, JOBS, (len(COSTS),), np.float32),
+        observation_space_mapping=lambda hospital: [hospital.waiting.count(cost) for cost in COSTS],
+        action_space=spaces.Discrete(len(COSTS)),
+        action_space_mapping=lambda kind: COSTS[kind],
+        reward_mapping=difference(lambda hospital: -hospital.costs_now()),
+        agent="nurse",
+    )
+    def call(self) -> int:
+        """Choose the kind of the next patient, where patients of both kinds wait."""
+        return self.waiting[0]
+
+    def treat(self, doctor: int) -> Generator[Any, Any, None]:
+        """Treat patients as long as some wait."""
+        self.free[doctor] = False
+        while self.waiting:
+            kind = self.call() if len(set(self.waiting)) > 1 else self.waiting[0]
+            self.waiting.remove(kind)
+            yield self.sim.timeout(self.draw(f"doctor {doctor}", DOCTORS[doctor]))
+            self.change(-kind)
+        self.free[doctor] = True
+
+
 MODELS: Final[dict[str, tuple[type[Work], Any]]] = {
     "factory, one generator": (SharedFactory, Factory.dispatch),
     "factory, streams": (Factory, Factory.dispatch),
     "queue network, streams": (Network, Network.admit),
+    "hospital, streams": (Hospital, Hospital.call),
 }

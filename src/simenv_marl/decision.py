@@ -56,6 +56,7 @@ class Definition:
     observation_space_mapping: Mapped
     action_space: Space
     reward_mapping: Mapped
+    cost_mapping: Mapped | None
     action_space_mapping: Function | None
     apply: Mapped | None
     choices: Mapped | None
@@ -126,6 +127,7 @@ def make_step(
     action_space: Space,
     action_space_mapping: Function | Mapping[Any, Any] | None = None,
     reward_mapping: Mapped,
+    cost_mapping: Mapped | None = None,
     apply: Mapped | None = None,
     choices: Mapped | None = None,
     split: Mapped | None = None,
@@ -165,6 +167,9 @@ def make_step(
             value.
         reward_mapping: A callable like ``observation_space_mapping``, called at each decision of
             the agent and at its end. It returns the reward of the agent's previous action.
+        cost_mapping: A callable like ``reward_mapping`` that returns the cost of the agent's
+            previous action, for learners with constraints: ``info["cost"]``. Costs are summed where
+            rewards are.
         apply: An alternative to ``action_space_mapping``: a callable of the action and the call's
             arguments, which runs in the simulation instead of the rule. The decision function
             returns its result. With a keyword-only parameter ``_rule`` it gets the rule, to run it

@@ -9,12 +9,14 @@ from .collect import (
 from .demonstrations import record_dataset, save_dataset
 from .deployed import joint_policy, turn_policy
 from .plots import plot_returns
+from .pool import OpponentPool
 from .timeline import plot_timeline
 from .trajectories import Trajectories
 
 __all__ = [
     "Comparison",
     "Mixture",
+    "OpponentPool",
     "Trajectories",
     "collect_episodes",
     "compare_with_rule",

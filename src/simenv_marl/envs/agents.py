@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any, Self
 
@@ -23,6 +23,13 @@ def refuse_unknown_agents(plan: Plan) -> None:
             'state_space="observations" needs to know all agents beforehand: declare them in'
             " possible_agents="
         )
+
+
+def add_costs(info: Info, agents: Iterable[Agent]) -> None:
+    """Add the sum of the costs of agents to an info, if they have any."""
+    costs = [agent.cost for agent in agents if agent.cost is not None]
+    if costs:
+        info["cost"] = sum(costs)
 
 
 class AgentsView(View):

@@ -23,7 +23,7 @@ from ..core import (
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE, optional_method
-from .agents import UnitedView
+from .agents import UnitedView, add_costs
 from .base import StepResult
 
 
@@ -108,11 +108,11 @@ class Joint:
         agents = [episode.agents.get(name) or episode.ended[name] for name in self.roster]
         used = () if episode.round is None else episode.round.acted
         observation, info = self.see(agents, episode.pending, used)
+        paid = (*episode.just_ended, *episode.agents.values())
         reward = episode.earned
         if reward is None:
-            reward = 0.0
-            for agent in (*episode.just_ended, *episode.agents.values()):
-                reward += agent.reward
+            reward = sum([agent.reward for agent in paid], 0.0)
+        add_costs(info, paid)
         return observation, reward, episode.terminated, episode.truncated, info
 
     def see(

@@ -30,7 +30,7 @@ from ..core import (
 from ..decision import DecisionPoint
 from ..errors import ViewError, listed
 from ..simulation import RULE
-from .agents import UnitedView, refuse_unknown_agents
+from .agents import UnitedView, add_costs, refuse_unknown_agents
 from .base import StepResult
 
 RULE_ACTION = "rule_action"
@@ -256,17 +256,19 @@ class SimulationTurnEnv(UnitedView):
         if agent is None:
             agent = before
             ends = episode.terminated, episode.truncated
-            reward = sum([each.reward for each in episode.agents.values()], 0.0)
+            paid = list(episode.agents.values())
         else:
-            reward = agent.reward
+            paid = [agent]
         if episode.just_ended and not begins:
-            reward += sum([each.reward for each in episode.take_ended()])
-        if episode.earned is not None:
-            reward = episode.earned
+            paid += episode.take_ended()
+        reward = episode.earned
+        if reward is None:
+            reward = sum([each.reward for each in paid], 0.0)
         self.own_agent = agent
         self.own_seat = turn.seats[agent.point.hook]
         info = agent.info
         info["agent"] = agent.name
+        add_costs(info, paid)
         if turn.translates or agent.mask is None:  # else the info has it
             mask = turn.mask(agent)
             if mask is not None:

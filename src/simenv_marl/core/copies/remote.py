@@ -21,8 +21,9 @@ from ...errors import (
     warn_user,
 )
 from ...simulation import Action, Model
-from ..episodes.agent import Agent, Clock
+from ..episodes.agent import Agent
 from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
+from ..episodes.clock import Clock
 from ..episodes.episode import Episode
 from ..episodes.events import PointHandler
 from ..episodes.session import Session

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import exp
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,30 +21,8 @@ from ..values.actions import MASK, Mask, only_choice
 from ..values.rewards import checked_reward
 from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
+from .clock import Clock
 from .decision import Decision
-
-
-@dataclass(eq=False, slots=True)
-class Clock:
-    """Reads the simulation's time.
-
-    Attributes:
-        time: Returns the simulation's time.
-        rate: The discount rate per unit of time. None: infos have no discount.
-    """
-
-    time: Callable[[], float]
-    rate: float | None
-
-    def read(self, before: float | None) -> dict[str, Any]:
-        """Return the time, and the time elapsed since an earlier one, as an info."""
-        read = self.time
-        time = read()
-        now = time if type(time) is float else float(time)
-        info: dict[str, Any] = {"time": now, "elapsed": 0.0 if before is None else now - before}
-        if self.rate is not None:
-            info["discount"] = exp(-self.rate * info["elapsed"])
-        return info
 
 
 class DecisionHandler(AnyHandler, Protocol):
@@ -112,6 +89,7 @@ class Agent:
         plugins: The handlers that take part in its mappings.
         memory: Values of this agent in this episode: of differences, and of policies.
         reward: The reward of its previous action, as of its latest decision or its end.
+        cost: The cost of its previous action, in the same way. None without ``cost_mapping``.
         raw_observation: The latest observation, unless the user may have changed it.
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
@@ -141,7 +119,9 @@ class Agent:
     arguments: Arguments = field(init=False)
     memory: dict[Any, Any] = field(default_factory=dict)
     reward: float = 0.0
+    cost: float | None = None
     _carried: float = 0.0  # the sum of the rewards of forced moves
+    _carried_cost: float = 0.0
     raw_observation: Observation = None
     # The numbers of an array that the user has. Empty once the library has read it.
     _numbers: bytes | None = None
@@ -227,8 +207,7 @@ class Agent:
         self.arguments = Arguments(point)
         self.mask = None
         self.choices = None
-        informs = point.definition.rule_action_mapping is not None
-        self._is_quick = self.decided and point.legal is None and not informs
+        self._is_quick = self.decided and point.is_quick
 
     def refusal(self) -> AgentError:
         """Make the error for a decision after the end of its episode."""
@@ -388,15 +367,21 @@ class Agent:
             EVALUATING[here] = self
         try:
             point = self.point
-            if reward and self.decided:
+            rewards = self.decided
+            if reward and rewards:
                 self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
             elif reward and not last:  # it has not acted yet, so this value rewards nothing
                 point.reward_mapping(*args, **kwargs)
                 self.decided = True
-                informs = point.definition.rule_action_mapping is not None
-                self._is_quick = point.legal is None and not informs
+                self._is_quick = point.is_quick
+            charge = point.cost_mapping
+            if reward and self.decided and charge is not None:
+                cost = checked_reward(self.name, charge(*args, **kwargs), "cost")
+                self.cost = cost if rewards else 0.0
             if observe:
                 self._observe(args, kwargs, asked)
+            if self.cost is not None:
+                self.info["cost"] = self.cost
         finally:
             if here is not None:
                 # Without a function call, which fails at the recursion limit.
@@ -484,7 +469,7 @@ class Agent:
             return
         point = self.point
         observes = not any(mapping.takes_any(unseen) for mapping in point.takes_for_observation)
-        pays = not point.takes_for_reward.takes_any(gone)
+        pays = not any(mapping.takes_any(gone) for mapping in point.takes_for_reward)
         if not observes:
             self.clear_observation()
         self.reward = 0.0
@@ -509,10 +494,14 @@ class Agent:
         self.delegated = True
 
     def carry_reward(self, carry_on: bool) -> None:
-        """Add the rewards of forced moves. Carry the sum on where no reward is returned."""
+        """Add the rewards and costs of forced moves. Carry them on where none are returned."""
         total = self.reward + self._carried
         self.reward = 0.0 if carry_on else total
         self._carried = total if carry_on else 0.0
+        if self.cost is not None:
+            total = self.cost + self._carried_cost
+            self.cost = self.info["cost"] = 0.0 if carry_on else total
+            self._carried_cost = total if carry_on else 0.0
 
     def reward_so_far(self) -> float:
         """In a branch, return the reward of its latest action by now."""
@@ -543,7 +532,7 @@ class Agent:
         return action
 
     def clear_observation(self, *, forget: bool = False) -> None:
-        """Set the reward to 0.0, and the info to one without an observation.
+        """Set the reward and the cost to 0.0, and the info to one without an observation.
 
         ``forget``: whether the last observation goes. Else it stays.
         """
@@ -555,6 +544,8 @@ class Agent:
             self.info = {}
         else:
             self.read_clock()
+        if self.cost is not None:
+            self.cost = self.info["cost"] = 0.0
         if self.point.legal is not None:
             self.info[MASK] = self.point.open_mask()
 

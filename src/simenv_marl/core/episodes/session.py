@@ -32,7 +32,6 @@ from ..switching.context import GlobalRandom, environment_context
 from ..switching.driver import Driver, Job
 from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.spaces import same
-from .agent import Clock
 from .base import (
     LONGEST_TAPE,
     BaseSession,
@@ -43,6 +42,7 @@ from .base import (
     ResetOptions,
     Tape,
 )
+from .clock import Clock
 from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames

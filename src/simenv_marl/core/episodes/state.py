@@ -38,7 +38,8 @@ from ..values.actions import ILLEGAL
 from .steps import Round
 
 if TYPE_CHECKING:
-    from .agent import Agent, Clock
+    from .agent import Agent
+    from .clock import Clock
     from .decision import Decision
 
 

@@ -54,6 +54,7 @@ _LEADING: Final = {
     "agent": 0,
     "observation_space_mapping": 0,
     "reward_mapping": 0,
+    "cost_mapping": 0,
     "action_mask_mapping": 0,
     "choices": 0,
     "action_labels": 0,
@@ -110,7 +111,9 @@ class Point:
         name_agent: A callable of the call's arguments that names the agent, if ``agent`` is None.
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
         takes_for_observation: The mappings that make an observation, with its mask and choices.
-        takes_for_reward: The reward mapping, with the arguments that it takes.
+        takes_for_reward: The mappings of rewards and costs, with the arguments that they take.
+        cost_mapping: The mapping of costs. None without.
+        is_quick: Whether an observation and a reward are all that a decision needs.
         taken_places: The number of positional arguments up to the last one that mappings take after
             the decision. None: all.
         taken_keys: The keyword arguments that they take. None: all.
@@ -128,9 +131,10 @@ class Point:
     """
 
     __slots__ = (
-        "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
-        "deliver", "expects_one", "gather", "gives_answers", "hook", "legal", "masked_parts",
-        "name_agent", "needs_simulation", "observation_mapping", "observes_arrays", "part",
+        "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "cost_mapping",
+        "definition", "deliver", "expects_one", "gather", "gives_answers", "hook", "is_quick",
+        "legal", "masked_parts", "name_agent", "needs_simulation", "observation_mapping",
+        "observes_arrays", "part",
         "policy", "removed_by", "reports_rule", "reward_mapping", "rule_action_mapping", "split",
         "taken_keys", "taken_places", "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
@@ -203,11 +207,13 @@ class Point:
         self.name_agent = calls.get("agent", _same)
         self.observation_mapping = calls["observation_space_mapping"]
         self.reward_mapping = calls["reward_mapping"]
-        self.takes_for_reward = fitted["reward_mapping"]
+        self.cost_mapping = calls.get("cost_mapping")
+        pays = ("reward_mapping", "cost_mapping")
+        self.takes_for_reward = [fitted[name] for name in pays if name in fitted]
         makes_observation = ("observation_space_mapping", "action_mask_mapping", "choices")
         self.takes_for_observation = [fitted[name] for name in makes_observation if name in fitted]
         texts = [fitted[name] for name in _TEXTS if name in fitted]
-        taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *texts])
+        taken = taken_by([*self.takes_for_observation, *self.takes_for_reward, *texts])
         self.taken_places: int | None = None
         self.taken_keys = taken
         if taken is not None:
@@ -216,6 +222,8 @@ class Point:
             self.taken_keys = taken.difference(places)
         self.convert: Callable[[Action], Model] = parts["action_space_mapping"] or _same
         self.legal = self._legal()
+        informs = definition.rule_action_mapping is not None
+        self.is_quick = self.legal is None and self.cost_mapping is None and not informs
         self.masked_parts = _masked_parts(definition.observation_space) if self.legal else []
         self.deliver = self._delivery()
         self.split = calls.get("split")

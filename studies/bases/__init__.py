@@ -1,0 +1,1 @@
+"""What stands for the other planners in a planner's branches."""

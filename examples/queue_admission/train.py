@@ -21,10 +21,9 @@ import torch
 from gymnasium.wrappers import TransformReward
 from matplotlib.figure import Figure
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 
 from simenv_marl import evaluate
+from simenv_marl.data import TimedReplayBuffer, TimedRolloutBuffer
 
 from .env import AGENT, QueueSimulation, env, observation
 from .exact import ADMIT_ALL, DECISIONS, Table, best_table, worth
@@ -37,68 +36,6 @@ SCALE: Final = 0.1
 
 GAMMAS: Final = (0.5, 0.9, 0.99)
 """The discounts for each decision that are compared with the discount for the elapsed time."""
-
-# -- discounting by time in Stable-Baselines3 ------------------------------------------------------
-
-
-class TimedReplay(ReplayBuffer):
-    """A replay buffer that discounts each transition by its own time."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.discounts = np.ones((self.buffer_size, 1), np.float32)
-
-    def add(
-        self,
-        obs: Any,
-        next_obs: Any,
-        action: Any,
-        reward: Any,
-        done: Any,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Store a transition of the one environment."""
-        self.discounts[self.pos] = infos[0]["discount"]
-        super().add(obs, next_obs, action, reward, done, infos)
-
-    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
-        discounts = self.to_torch(self.discounts[batch_inds])
-        return super()._get_samples(batch_inds, env)._replace(discounts=discounts)
-
-
-class TimedRollout(RolloutBuffer):
-    """A rollout buffer that discounts each transition by its own time.
-
-    ``Times`` fills its ``discounts``.
-    """
-
-    def reset(self) -> None:
-        """Begin a rollout."""
-        super().reset()
-        self.discounts = np.ones((self.buffer_size, self.n_envs), np.float32)
-
-    def compute_returns_and_advantage(self, last_values: Any, dones: Any) -> None:
-        """Estimate advantages (GAE), in which each step has its own discount."""
-        values = np.vstack([self.values, last_values.cpu().numpy().reshape(1, -1)])
-        weights = self.discounts * (1 - np.vstack([self.episode_starts[1:], dones]))
-        advantage = 0.0
-        for step in reversed(range(self.buffer_size)):
-            error = self.rewards[step] + weights[step] * values[step + 1] - values[step]
-            self.advantages[step] = advantage = error + self.gae_lambda * weights[step] * advantage
-        self.returns = self.advantages + self.values
-
-
-class Times(BaseCallback):
-    """Hand the discounts in the infos to the rollout buffer and to PPO.
-
-    PPO's gamma weighs the ends of episodes.
-    """
-
-    def _on_step(self) -> bool:
-        buffer: Any = self.model.rollout_buffer
-        buffer.discounts[buffer.pos] = self.model.gamma = self.locals["infos"][0]["discount"]
-        return True
-
 
 # -- training --------------------------------------------------------------------------------------
 
@@ -113,7 +50,7 @@ def train_dqn(seed: int, steps: int = 60_000, gamma: float | None = None) -> Any
     ``gamma`` is a discount for each decision; None: the discount of the elapsed time.
     """
     timed: dict[str, Any] = (
-        {"replay_buffer_class": TimedReplay} if gamma is None else {"gamma": gamma}
+        {"replay_buffer_class": TimedReplayBuffer} if gamma is None else {"gamma": gamma}
     )
     learner = DQN(
         "MlpPolicy",
@@ -139,9 +76,9 @@ def train_ppo(seed: int, steps: int = 120_000) -> Any:
         gae_lambda=0.9,
         ent_coef=0.003,
         seed=seed,
-        rollout_buffer_class=TimedRollout,
+        rollout_buffer_class=TimedRolloutBuffer,
     )
-    return learner.learn(steps, callback=Times())
+    return learner.learn(steps)
 
 
 def policy_of(learner: Any) -> Callable[[Any], Any]:

@@ -54,6 +54,7 @@ EXTRAS: Final = {
     "pyDOE": "design",
     "SALib": "design",
     "openai": "language",
+    "stable_baselines3": "clients",
     "starlette": "play",
     "uvicorn": "play",
     "websockets": "play",

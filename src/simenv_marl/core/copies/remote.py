@@ -23,13 +23,13 @@ from ...errors import (
 from ...simulation import Action, Model
 from ..episodes.agent import Agent
 from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
-from ..episodes.clock import Clock
 from ..episodes.episode import Episode
 from ..episodes.events import PointHandler
 from ..episodes.session import Session
 from ..episodes.state import EpisodeState, State
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
+from ..values.clock import Clock
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection
 from .packing import pack_checked, pack_outcome, unpack
 from .peer import pack_request

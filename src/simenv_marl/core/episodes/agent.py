@@ -18,10 +18,10 @@ from ..plans.point import Args, Kwargs, Point, Policy
 from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
+from ..values.clock import Clock
 from ..values.rewards import checked_reward
 from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
-from .clock import Clock
 from .decision import Decision
 
 

@@ -49,10 +49,10 @@ from ..plans.policies import (
 )
 from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
+from ..values.clock import Clock
 from ..values.spaces import duplicate
 from .agent import Agent, DecisionHandler
 from .base import GO_ON, LONGEST_TAPE, EpisodeOwner, Replay, Tape
-from .clock import Clock
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
 from .steps import Round, Team

@@ -31,6 +31,7 @@ from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
 from ..switching.driver import Driver, Job
 from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
+from ..values.clock import Clock
 from ..values.spaces import same
 from .base import (
     LONGEST_TAPE,
@@ -42,7 +43,6 @@ from .base import (
     ResetOptions,
     Tape,
 )
-from .clock import Clock
 from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames

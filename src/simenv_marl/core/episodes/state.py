@@ -38,8 +38,8 @@ from ..values.actions import ILLEGAL
 from .steps import Round
 
 if TYPE_CHECKING:
+    from ..values.clock import Clock
     from .agent import Agent
-    from .clock import Clock
     from .decision import Decision
 
 

@@ -370,14 +370,15 @@ def fingerprint(simulation: SteppedSimulation) -> str:
     ]
     layers = getattr(getattr(model, "grid", None), "_mesa_property_layers", {})
     landscape = {name: plain(layer.data) for name, layer in layers.items()}
+    # A model of Mesa 4.0.0a0 has a seed in place of this generator.
+    generator = getattr(model.rng, "bit_generator", None)
+    state = None if generator is None else generator.state
     collected = (
         plain(list(model.datacollector.model_vars.values()))
         if hasattr(model, "datacollector")
         else None
     )
-    return repr(
-        [agents, landscape, model.random.getstate(), model.rng.bit_generator.state, collected]
-    )
+    return repr([agents, landscape, model.random.getstate(), state, collected])
 
 
 def positions(agent: Any) -> Any:

@@ -19,6 +19,7 @@ from simenv_marl.errors import (
     ViewError,
     did_you_mean,
 )
+from tests.processes import run_code
 from tests.worlds.copied import Walk
 from tests.worlds.models import define
 
@@ -189,3 +190,17 @@ def test_a_name_of_a_room_is_told_by_imports_and_attributes():
     with pytest.raises(ImportError, match="cannot import name 'nothing'"):
         exec("from simenv_marl import nothing")
     exec("from simenv_marl import envs, plugins, registration")
+
+
+def test_a_free_threaded_build_is_refused():
+    shown = run_code(
+        """
+        import sysconfig
+        sysconfig.get_config_vars()["Py_GIL_DISABLED"] = 1
+        try:
+            import simenv_marl
+        except ImportError as error:
+            print(error)
+        """
+    )
+    assert "simenv_marl needs a Python with the global interpreter lock" in shown

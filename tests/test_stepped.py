@@ -48,6 +48,23 @@ class Planned(Walk):
         super().__init__(**(scenario or {}))
 
 
+class Clocked:
+    """Events between whole units of time, and no steps."""
+
+    def __init__(self, seed=None):
+        self.time = 0.0
+        self.log = []
+
+    def run_for(self, duration):
+        for moment in (0.25, 0.75):
+            self.time = float(int(self.time)) + moment
+            self.log.append(self.ring())
+        self.time = float(int(self.time)) + duration
+
+    def ring(self):
+        return -1
+
+
 STRIDE = {
     f"{__name__}.Walk.stride": define(
         observation_space_mapping=lambda walk: [walk.place, 0.0],
@@ -147,3 +164,25 @@ def test_points_are_those_that_are_named():
         SteppedSimulation(Walk, 5), {"stride_0": lambda place: 2}, points=STRIDE, seed=2
     )
     assert played.model.place == walked(2, 5, drift=1.0)
+
+
+def test_a_model_without_steps_runs_for_units_of_time():
+    ring = {f"{__name__}.Clocked.ring": define()}
+    env = single_env(SteppedSimulation(Clocked, 2), ring)
+    _, info = env.reset(seed=1)
+    times = [info["time"]]
+    truncated = False
+    while not truncated:
+        *_, truncated, info = env.step(3)
+        times.append(info["time"])
+    assert times == [0.25, 0.75, 1.25, 1.75, 2.0]
+    assert env.unwrapped.simulation.model.log == [3] * 4
+
+
+def test_the_time_is_the_number_of_steps_where_a_model_has_no_clock():
+    class Timeless(Walk):
+        def time(self):
+            return "late"
+
+    simulation = simulate(SteppedSimulation(Timeless, 3), {}, seed=1)
+    assert simulation.time() == 3.0

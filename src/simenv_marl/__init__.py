@@ -34,8 +34,15 @@ decision through the package.
 """
 
 import sys
+import sysconfig
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if sysconfig.get_config_var("Py_GIL_DISABLED"):
+    raise ImportError(
+        "simenv_marl needs a Python with the global interpreter lock: greenlet crashes in"
+        " free-threaded builds. Use the ordinary build of the same version"
+    )
 
 if TYPE_CHECKING:
     from .core.copies.clone import branch, clone

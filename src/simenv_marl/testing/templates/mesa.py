@@ -175,3 +175,5 @@ if __name__ == "__main__":
     evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
     print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
     print(evaluation.summary().round(1).to_string())
+    if mesa.__version__ == "3.3.1":
+        print("Mesa 3.3.1 keeps each model in memory; newer ones (Python 3.12) do not.")

@@ -1,6 +1,9 @@
 # Each target does all of its own set-up; it needs only python3 with venv and pip.
 
-PYTHON ?= python3
+PYTHONS := 3.14 3.13 3.12 3.11
+PYTHON ?= $(shell sh tools/python.sh $(PYTHONS))
+# PyTorch is there for this one, and the oldest versions of dependencies are.
+OLDEST_PYTHON ?= $(shell sh tools/python.sh 3.11)
 BIN := .venv/bin
 # Tests start hundreds of processes, each of which would compile the library anew where this is set.
 export PYTHONDONTWRITEBYTECODE :=
@@ -87,7 +90,7 @@ test-browser: .venv-browser/.browser
 	.venv-browser/bin/python -m pytest -rs tests/seats/play/test_browser.py
 
 .venv-clients/.clients .venv-rllib/.rllib .venv-benchmarl/.benchmarl .venv-wrappers/.wrappers .venv-browser/.browser .venv-bounds/.bounds: pyproject.toml
-	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	test -x $(@D)/bin/python || $(OLDEST_PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@
 
@@ -99,7 +102,7 @@ test-oldest: .venv-oldest/.oldest
 	.venv-oldest/bin/python -m pytest --driver greenlet $(OLDEST_TESTS)
 
 .venv-oldest/.oldest: pyproject.toml tests/oldest.txt
-	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	test -x $(@D)/bin/python || $(OLDEST_PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis pytest simpy
 	touch $@
 
@@ -119,12 +122,12 @@ test-wheel:
 	mkdir -p build/sdist && tar -xzf dist/*.tar.gz --strip-components 1 -C build/sdist && rm -r build/sdist/src
 	cd build/sdist && ../../.venv-wheel/bin/python -m pytest --quiet -n 2 --driver greenlet $(WHEEL_TESTS)
 
-# Builds and tests what is published, and checks that changelog and citation have its version. Upload it by hand.
-release: test-wheel
+# Builds and tests what is published, builds it again to compare the bytes, and prints the command that uploads it.
+release: test-wheel test-templates
+	.venv-wheel/bin/python -m build --outdir build/again .
 	.venv-wheel/bin/python -m tools.release
 
 # Each supported Python, but for the one of .venv. What is not found is told of.
-PYTHONS := 3.11 3.12 3.13
 test-pythons:
 	sh tools/pythons.sh "$(TESTED_WITH)" \
 	    "tests/contract tests/core tests/data/test_collected.py tests/data/test_rule_actions.py tests/envs" \
@@ -138,7 +141,7 @@ test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 .venv-dask/.experiments: CLUSTER := dask[distributed]>=2025.1
 .venv-ray/.experiments: CLUSTER := ray>=2.40
 .venv-dask/.experiments .venv-ray/.experiments: pyproject.toml
-	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	test -x $(@D)/bin/python || $(OLDEST_PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
 
@@ -151,9 +154,10 @@ test-outside: .venv/.test
 	done
 	$(BIN)/python -m pytest -n 2 -rs tests/outside
 
-# The built wheel, on the newest Python that is there: templates from an empty folder, and the newest Mesa.
+# The built wheel, on the newest and the oldest Python that are there: templates from an empty folder, and the newest Mesa.
 test-templates:
-	sh tools/templates.sh
+	sh tools/templates.sh $(PYTHONS)
+	sh tools/templates.sh 3.11
 
 lint: .venv/.test
 	$(BIN)/ruff check .

@@ -6,12 +6,8 @@ packages=$1 tests=$2
 shift 2
 
 for version; do
-    python=""
-    for found in "python$version" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version".*/bin/python; do
-        # A shim of pyenv is on the PATH also where its Python is not active.
-        "$found" -c "import venv" 2> /dev/null && python=$found && break
-    done
-    if [ -z "$python" ]; then
+    python=$(sh tools/python.sh "$version")
+    if [ "$python" = python3 ]; then
         echo "Python $version is not found; it is not tested." >&2
         continue
     fi

@@ -1,7 +1,8 @@
-"""Check a release: the changelog, the citation and the built files name its version.
+"""Check a release: changelog, citation and built files name its version, and builds are the same.
 
 The version stands in one place. ``make release`` builds and tests the wheel and the source
-distribution, and then runs this.
+distribution, builds both again in ``build/again``, and then runs this. It prints the command that
+uploads them.
 """
 
 from __future__ import annotations
@@ -30,10 +31,16 @@ def problems() -> list[str]:
     if f"\nversion: {version}\n" not in (ROOT / "CITATION.cff").read_text(encoding="utf-8"):
         wrong.append(f"CITATION.cff must have the line 'version: {version}'")
     for name in (f"simenv_marl-{version}-py3-none-any.whl", f"simenv_marl-{version}.tar.gz"):
-        if not (ROOT / "dist" / name).exists():
-            wrong.append(f"dist/{name} is missing; run make test-wheel")
+        built, again = ROOT / "dist" / name, ROOT / "build" / "again" / name
+        if not (built.exists() and again.exists()):
+            wrong.append(f"dist/{name} or build/again/{name} is missing; run make release")
+        elif built.read_bytes() != again.read_bytes():
+            wrong.append(f"dist/{name} and build/again/{name} differ; builds must be the same")
     return wrong
 
 
 if __name__ == "__main__":
-    sys.exit("\n".join(problems()) or 0)
+    found = problems()
+    if not found:
+        print("\nReady. This uploads it:\n\n    .venv-wheel/bin/twine upload dist/*\n")
+    sys.exit("\n".join(found) or 0)

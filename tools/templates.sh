@@ -1,14 +1,14 @@
 #!/bin/sh
-# Builds the wheel, installs it, and creates each template in an empty folder and runs its tests. Uses the newest Python
-# found, and with it the newest Mesa, whose example models are tested as well.
+# Builds the wheel, installs it, and creates each template in an empty folder and runs its tests. Uses the first Python that
+# is found of those that are named, and the newest Mesa for it, whose example models are tested as well.
+#   sh tools/templates.sh 3.14 3.13
 set -eu
 cd "$(dirname "$0")/.."
 venv=$PWD/.venv-templates
 quiet="--quiet --disable-pip-version-check"
 
-for python in python3.13 python3.12 "$HOME"/.pyenv/versions/3.13.*/bin/python "$HOME"/.pyenv/versions/3.12.*/bin/python python3; do
-    if "$python" -c "" 2> /dev/null; then break; fi
-done
+python=$(sh tools/python.sh "$@")
+venv=$venv-$("$python" -c 'import sys; print(sys.version_info.minor)')
 test -x "$venv/bin/python" || "$python" -m venv "$venv"
 "$venv/bin/python" --version
 

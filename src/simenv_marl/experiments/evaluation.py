@@ -103,7 +103,24 @@ class Evaluation:
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
     def __str__(self) -> str:
-        return f"{self!r}\n{self.summary().to_string(float_format='{:.6g}'.format)}"
+        """Return a table of the returns: means, differences from the baseline, and intervals."""
+        summary = self.summary()
+        estimates = {"mean": ("mean", "low", "high")}
+        if self.baseline is not None:
+            gains = "difference", "difference_low", "difference_high"
+            estimates[f"more than {self.baseline}"] = gains
+        shown = summary.drop(columns=[name for names in estimates.values() for name in names])
+        for title, (middle, low, high) in reversed(estimates.items()):
+            bounds = [
+                f"({least:.4g} to {most:.4g})"
+                for least, most in zip(summary[low], summary[high], strict=True)
+            ]
+            shown.insert(0, f"{self.confidence:.0%} interval", bounds, allow_duplicates=True)
+            shown.insert(0, title, summary[middle].map("{:.4g}".format))
+        if self.baseline is not None:
+            shown.iloc[shown.index.get_loc(self.baseline), 2:4] = ""
+        text: str = shown.rename_axis(None).to_string(float_format="{:.1%}".format)
+        return text
 
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""

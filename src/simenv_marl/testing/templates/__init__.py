@@ -55,23 +55,28 @@ def write_template(kind: str, name: str, folder: Path | None = None) -> str:
             raise OptionValueError(
                 f"{path} exists already, and is not overwritten; choose another name or folder"
             )
-    title = name.title().replace("_", "")
+    title = name.title().replace("_", "").removesuffix("Model")
+    files = {module: template, tests: _TESTS.replace("my_model", name)}
+    if not folder.exists():
+        # In a checkout of the library, its own options of pytest would hide the module.
+        files[folder / "pytest.ini"] = "[pytest]\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for path, text in ((module, template), (tests, _TESTS.replace("my_model", name))):
+        for path, text in files.items():
             for part in ("Model", "Simulation"):
                 text = text.replace(f"My{part}", f"{title}{part}")
             path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OptionValueError(f"{error.filename} cannot be written: {error.strerror}") from error
-    return f"""wrote {module}
-wrote {tests}
+    written = "\n".join(f"wrote {path}" for path in files)
+    return f"""{written}
 
 Next:
   pip install "simenv-marl[experiments]" pytest {KINDS[kind]}
   cd {shlex.quote(str(folder))}
   python -m {name}    # trains, and compares with the model's own rule
-  python -m pytest"""
+  python -m pytest
+  python -m simenv_marl play {name}:{title}Simulation    # decide yourself; with [play]"""
 
 
 def _check_name(name: str) -> None:

@@ -5,7 +5,7 @@ own rule.
 """
 
 import sys
-from typing import Any
+from typing import Any, ClassVar
 
 import mesa
 import numpy as np
@@ -131,7 +131,7 @@ move = make_step(
 class MySimulation(SteppedSimulation):
     """Fifty days: each reset makes a model with its seed, and run steps it."""
 
-    points = {Rabbit.choose_cell: move}  # the classes of the model do not change
+    points: ClassVar = {Rabbit.choose_cell: move}  # the classes of the model do not change
 
     def __init__(self) -> None:
         super().__init__(MyModel, 50)
@@ -173,7 +173,7 @@ if __name__ == "__main__":
     policies = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}
     seeds = range(100_000, 100_005 if quick else 100_030)  # other meadows than in training
     evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
-    print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
-    print(evaluation.summary().round(1).to_string())
+    print("What all rabbits have eaten, on the same meadows:")
+    print(evaluation)
     if mesa.__version__ == "3.3.1":
         print("Mesa 3.3.1 keeps each model in memory; newer ones (Python 3.12) do not.")

@@ -5,7 +5,7 @@ own rule.
 """
 
 import sys
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import simpy
@@ -111,7 +111,7 @@ dispatch = make_step(
 class MySimulation(SimulationInterface):
     """A day of eight hours."""
 
-    points = {MyModel.choose_job: dispatch}  # the class of the model does not change
+    points: ClassVar = {MyModel.choose_job: dispatch}  # the class of the model does not change
 
     def reset(self, seed: int | None = None) -> None:
         """Begin a day."""
@@ -163,5 +163,5 @@ if __name__ == "__main__":
     policies = {"rule": {}, "trained": {"dispatcher_0": policy}}
     seeds = range(100_000, 100_010 if quick else 100_050)  # other days than in training
     evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
-    print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
-    print(evaluation.summary().round(1).to_string())
+    print("Minus the hours late in a day, of the same days:")
+    print(evaluation)

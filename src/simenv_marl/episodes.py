@@ -46,9 +46,10 @@ from .errors import (
     describe_error,
     short_repr,
 )
-from .files.lines import Lines
+from .files.lines import Lines, to_line
+from .files.reader import malformed, read_episodes
 from .files.recipes import FORMAT, Json, arguments_of, changes_since, recipe_of
-from .files.tapes import FileTape, end_of, head_of, recorder, to_text
+from .files.tapes import FileTape, end_of, head_of, recorder
 from .files.values import decode_value
 from .simulation import Action, Sentinel
 
@@ -151,10 +152,9 @@ def _repeat(view: Any, seed: int, options: Any, replay: Replay) -> None:
 
 def _write(path: Path, lines: list[Json]) -> None:
     """Write lines to a file, which is never seen without some of them."""
-    text = "".join(f"{to_text(line)}\n" for line in lines)
     beside = path.with_name(f"{path.name}.{uuid4().hex[:8]}")
     try:
-        beside.write_bytes(text.encode(errors="surrogatepass"))
+        beside.write_bytes(b"".join(map(to_line, lines)))
         beside.replace(path)
     except OSError as error:
         with suppress(OSError):
@@ -194,7 +194,7 @@ def load_episode(
         StoreError: The file cannot be read.
         SimEnvError: Another argument is invalid.
     """
-    return _Loading(Path(path)).load(simulation, points, options)
+    return EpisodeFile(path).load(simulation, points, **options)
 
 
 def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> str:
@@ -208,57 +208,55 @@ def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> st
     Raises:
         SimEnvError: Any error of ``load_episode``.
     """
+    file = EpisodeFile(path, until)
     timeline: list[str] = []
-    loading = _Loading(Path(path), timeline)
-    if until is not None:
-        loading.stop_at(until)
-    view = loading.load(None, None, {})
+    view = file.load(timeline=timeline)
     head = f"{view.session.plan.name}, view {view.kind}, seed {view.session.seed}"
     timeline.append(f"now: {_shown(end_of(view.episode))}")
     view.close()
     return "\n".join((head, *timeline))
 
 
-class _Loading:
-    """A file that is being loaded."""
+class EpisodeFile:
+    """The last episode of a file, up to the decision that pends there.
 
-    def __init__(self, path: Path, timeline: list[str] | None = None) -> None:
-        """Read a file. ``timeline`` gets a text for each repeated decision."""
+    Attributes:
+        head: The first line.
+        lines: The lines of the answers, without the actions.
+        answers: The answers.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], until: int | None = None) -> None:
+        """Read a file, up to so many decisions.
+
+        Raises:
+            EpisodeFileError: It is malformed.
+            StoreError: It cannot be read.
+        """
         self._path = path
-        self._timeline = timeline
-        try:
-            lines = [*Lines(path).read()]
-        except OSError as error:
-            raise StoreError(f"{path} cannot be read: {describe_error(error)}") from error
-        except RecursionError:
-            raise self._malformed(1) from None
-        self._lines: list[Json] = []  # those of answers, without the actions
-        self._answers: list[Action] = []
+        episode = read_episodes(path)[-1]
+        self.lines: list[Json] = []
+        self.answers: list[Action] = []
+        self._numbers: list[int] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
-        number = 0
+        number = 1
         try:
-            for number, (place, line) in enumerate(lines, 1):
-                if number == 1:
-                    self._head = line | {"reset": decode_value(line.get("reset"))}
-                    self._view = VIEWS[line["view"]]
-                else:
-                    self._take(line)
-                if place != number:
-                    raise ValueError("there is a torn line before it")
-            if self._head["episode"] != FORMAT or not isinstance(self._head["versions"], dict):
+            self.head = episode.head | {"reset": decode_value(episode.head.get("reset"))}
+            self._view = VIEWS[self.head["view"]]
+            if self.head["episode"] != FORMAT or not isinstance(self.head["versions"], dict):
                 raise ValueError("it is of another version")
+            for number, line in episode.present:
+                self._take(number, {**line})
         except Exception as error:
-            raise self._malformed(number) from error
+            raise malformed(path, number) from error
         if "error" in self._last:
             self._cut()
+        if until is not None:
+            self._stop_at(until)
 
-    def _malformed(self, number: int) -> EpisodeFileError:
-        return EpisodeFileError(
-            f"line {number} of {self._path} is not what save_episode of this version writes"
-        )
-
-    def _take(self, line: Json) -> None:
+    def _take(self, number: int, line: Json) -> None:
         """Take a line after the first one."""
+        line.pop("play", None)
         if "reseed" in line:
             answer: Action = Reseeded(line["reseed"])
         elif "exit" in line:
@@ -270,42 +268,63 @@ class _Loading:
             return
         else:
             raise ValueError("it is no line of an answer")
-        self._lines.append(line)
-        self._answers.append(answer)
+        self._numbers.append(number)
+        self.lines.append(line)
+        self.answers.append(answer)
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
         self._last = {}
-        self.stop_at(max(self._places(), default=len(self._answers)))
+        self._leave_out(max(self._places(), default=len(self.answers)))
 
     def _places(self) -> list[int]:
         """Return the places of the user's answers."""
-        lines = enumerate(self._lines[: len(self._answers)])
+        lines = enumerate(self.lines)
         return [place for place, line in lines if "agent" in line and "by" not in line]
 
-    def stop_at(self, least: int) -> None:
-        """Leave out the user's next answer after so many answers, and whatever follows it."""
-        for place in self._places():
-            if place >= least:
-                self._last = self._lines[place]
-                del self._answers[place:]
-                return
+    def _stop_at(self, until: int) -> None:
+        """Leave out the user's next answer after so many decisions, and whatever follows it."""
+        decisions = [place for place, line in enumerate(self.lines) if "agent" in line]
+        if until < len(decisions):
+            later = [place for place in self._places() if place >= decisions[until]]
+            self._leave_out(min(later, default=len(self.answers)))
 
-    def load(self, simulation: Model, points: Points, options: ViewOptions) -> Any:
-        """Make the environment."""
+    def _leave_out(self, place: int) -> None:
+        """Leave out an answer, and whatever follows it."""
+        if place < len(self.answers):
+            self._last = self.lines[place]
+            for items in (self.lines, self.answers, self._numbers):
+                del items[place:]
+
+    def arguments(
+        self, simulation: Model = None, points: Points = None, **options: Unpack[ViewOptions]
+    ) -> tuple[Model, Points, dict[str, Any]]:
+        """Return the simulation, the points and the options.
+
+        Raises:
+            EpisodeFileError: The first line is malformed, or a name in it cannot be used.
+        """
         try:
-            arguments = arguments_of(self._head, simulation, points, dict(options))
+            return arguments_of(self.head, simulation, points, options)
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             if isinstance(error, SimEnvError):
                 raise
-            raise self._malformed(1) from error
-        plan = plan_of(*arguments)
-        view = self._view(plan)
+            raise malformed(self._path, 1) from error
+
+    def load(
+        self,
+        simulation: Model = None,
+        points: Points = None,
+        timeline: list[str] | None = None,
+        **options: Unpack[ViewOptions],
+    ) -> Any:
+        """Make the environment. ``timeline`` gets a text for each repeated decision."""
+        view = self._view(plan_of(*self.arguments(simulation, points, **options)))
         try:
-            problem = self._replay(view)
+            problem = self._replay(view, timeline)
             if problem is not None:  # the process was killed before it could write that
                 self._cut()
-                problem = self._replay(view)
+                problem = self._replay(view, None)
             if problem is not None:
                 raise problem
         except BaseException as error:
@@ -313,46 +332,46 @@ class _Loading:
             raise
         return view
 
-    def _replay(self, view: Any) -> Exception | None:
+    def _replay(self, view: Any, timeline: list[str] | None) -> Exception | None:
         """Bring the environment to the last line. Return the error of an answer at the very end."""
         session = view.session
         plan = session.plan
         is_recorded = plan.options.record is not None
         make_tape = recorder(plan, view.kind) if is_recorded else FileTape
-        expected = deque(self._lines[: len(self._answers)])
+        expected = deque(zip(self._numbers, self.lines, self.answers, strict=True))
 
         def differ(recorded: Json, line: Json) -> EpisodeFileError:
-            number = 2 + len(self._answers) - len(expected)
+            number = expected[0][0] if expected else [1, *self._numbers][-1] + 1
             return self._difference(plan, number, recorded, line)
 
         def compare(line: Json) -> None:
-            if expected and expected[0] != line:
-                raise differ(expected[0], line)
-            if expected and self._timeline is not None and "agent" in line:
+            if not expected:
+                return
+            if expected[0][1] != line:
+                raise differ(expected[0][1], line)
+            _, _, answer = expected.popleft()
+            if timeline is not None and "agent" in line:
                 agent = session.episode.latest
                 time = "" if agent.now is None else f"  at {agent.now:g}"
-                action = short_repr(self._answers[-len(expected)], 60)
+                action = short_repr(answer, 60)
                 by = ", by its policy" if "by" in line else ""
-                number = len(self._timeline) + 1
-                self._timeline.append(f"{number:6}{time}  {agent.name}: {action}{by}")
-            if expected:
-                expected.popleft()
+                timeline.append(f"{len(timeline) + 1:6}{time}  {agent.name}: {action}{by}")
 
         def make(session: Session) -> FileTape:
             tape = make_tape(session)
             tape.compare(compare)
             return tape
 
-        replay = Replay([*self._answers, GO_ON])
+        replay = Replay([*self.answers, GO_ON])
         session.make_tapes(make, replay)
         try:
-            _repeat(view, self._head["seed"], self._head["reset"], replay)
+            _repeat(view, self.head["seed"], self.head["reset"], replay)
         except EpisodeFileError:
             raise
         except Exception as error:
             if not self._last and (not replay or replay[0] is GO_ON):
                 return error
-            recorded = expected[0] if expected else self._last
+            recorded = expected[0][1] if expected else self._last
             raise differ(recorded, {"error": describe_error(error)}) from error
         finally:
             session.make_tapes(make_tape if is_recorded else None)
@@ -369,7 +388,7 @@ class _Loading:
             names = {"seen": "the observation", "mask": "the mask of legal actions"}
             differing = [text for key, text in names.items() if recorded.get(key) != line.get(key)]
             problem = f"{' and '.join(differing) or 'the answerer'} of {_shown(line)} differs"
-        reasons = changes_since(self._head, plan) or [
+        reasons = changes_since(self.head, plan) or [
             "has the model changed? It may also iterate over a set of strings, draw from a global"
             " generator (global_rng=True), or have been recorded with other floats of another"
             " machine"
@@ -383,4 +402,4 @@ class _Loading:
 def _shown(line: Json) -> str:
     """Return a line of a decision, an end or an error as words."""
     decision = f"a decision of {line['agent']!r}" if "agent" in line else ""
-    return line.get("error") or decision or to_text(line)
+    return line.get("error") or decision or to_line(line).decode(errors="replace").strip()

@@ -19,6 +19,7 @@ from .values import digest_of, encode_value
 Put = Callable[[Json], object]
 """Gets a line of a file."""
 
+
 def decision_of(episode: EpisodeState, agent: Agent) -> Json:
     """Return the line of a pending decision: the agent, and digests of observation and mask.
 

@@ -764,14 +764,13 @@ def test_the_ends_of_agents_are_in_the_recording(make_host, tmp_path):
     assert repr(loaded.last()) == repr(host.game.env.last())
 
 
-OLD = """\
-{"simulation": "shop", "seed": 5, "seats": []}
-{"turn": 0, "agent": "buyer", "number": 1, "action": 1, "words": "1", "by": "person", "seen": "@0", "time": 0.0}
-{"turn": 1, "agent": "seller", "number": 1, "action": [0, 1], "words": "", "by": "person", "seen": "@1", "time": 0.0}
-{"turn": 2, "agent": "buyer", "number": 2, "action": 3, "words": "3", "by": "person", "seen": "@2", "time": 1.0}
-{"turn": 2}
-{"turn": 2, "agent": "buyer", "number": 2, "action": null, "words": "", "by": "rule", "seen": "@2", "time": 1.0}
-"""
+OLD = [
+    (0, "buyer", 1, "person"),
+    (1, "seller", [0, 1], "person"),
+    (2, "buyer", 3, "person"),
+    (2, None, None, None),
+    (2, "buyer", None, "rule"),
+]
 
 
 def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
@@ -780,10 +779,12 @@ def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
     play(before, [1])
     before.abandon()
     before.game.decide([0, 1], "person")
-    text = OLD
-    for number, row in enumerate(before.game.timeline):
-        text = text.replace(f"@{number}", row["seen"])
-    path.write_text(text)
+    lines = [{"simulation": "shop", "seed": 5, "seats": []}]
+    for turn, agent, action, by in OLD:
+        answer = {"action": action, "by": by, "words": "", "number": 1, "time": 0.0}
+        seen = before.game.timeline[turn]["seen"]
+        lines.append({"turn": turn} | (answer | {"agent": agent, "seen": seen} if agent else {}))
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     again = make_host(seats=(), record=path)
     settle(again)
     assert [(row["action"], row["by"]) for row in again.game.timeline[:3]] == [

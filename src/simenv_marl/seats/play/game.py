@@ -291,7 +291,7 @@ class Game:
             self._fail(f"the policy of {agent} has failed: {describe_error(error)}")
 
     def _take(self, action: Action, by: str) -> tuple[Row, list[Json]]:
-        """Take the pending decision. Return its row, and the lines of the agents that have ended."""
+        """Take the pending decision. Return its row, and the lines of ended agents."""
         row = self.timeline[self.turn]
         self._step(row["agent"], action)
         self.forget(self.turn)

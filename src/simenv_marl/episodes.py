@@ -24,6 +24,9 @@ from uuid import uuid4
 
 from .core import (
     GO_ON,
+    Branched,
+    DeferredPolicy,
+    Mode,
     Model,
     Plan,
     Points,
@@ -32,11 +35,12 @@ from .core import (
     Reseeded,
     Session,
     ViewOptions,
+    Where,
     preserve_generators,
     same,
 )
 from .envs import VIEWS
-from .envs.single import plan_of
+from .envs.single import PlannerEnv, plan_of
 from .errors import (
     EpisodeFileError,
     SimEnvError,
@@ -53,6 +57,9 @@ from .files.tapes import FileTape, end_of, head_of, recorder
 from .files.values import decode_value
 from .simulation import Action, Sentinel
 
+SIMULATE: Final = "simulate"
+"""In place of the view, in a file of a branch of an episode without a user."""
+
 _EXIT: Final = Sentinel("EXIT")
 """Among answers: the ``None`` step of an agent that has ended."""
 
@@ -65,7 +72,8 @@ def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = Fals
 
     Args:
         env: An environment of one simulation, in any view, with or without wrappers, which are not
-            written; also a clone. A decision is pending, or the episode has ended.
+            written; also a clone, or a branch in a policy. A decision is pending, or the episode
+            has ended.
         path: The file. An existing one is replaced.
         unnamed: Whether to leave open whatever has no dotted name, such as a lambda. It must then
             be given to ``load_episode``.
@@ -73,25 +81,33 @@ def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = Fals
     Raises:
         EpisodeFileError: Something has no name, an action or an option is no data, or the
             simulation does not repeat the episode. Nothing is written.
-        ViewError: It is not an environment of one simulation, or is one that a policy is given.
+        ViewError: It is not an environment of one simulation, or is one that a policy is given and
+            is no branch or clone yet.
         ResetNeededError: There is no episode.
         BranchError: The episode has no complete tape.
         StoreError: The file cannot be written.
     """
     view = getattr(env, "unwrapped", env)
-    if getattr(view, "kind", "") not in VIEWS:
+    kind = getattr(view, "kind", "")
+    if isinstance(view, PlannerEnv) and view.is_branch:
+        plan = view.session.plan
+        policies = (plan.options.policies or {}).values()
+        is_alone = not (plan.has_user or any(isinstance(each, DeferredPolicy) for each in policies))
+        kind = view.session.kind or (SIMULATE if is_alone else "")
+    if kind not in (*VIEWS, SIMULATE):
         raise ViewError(
-            f"save_episode needs an environment of one simulation, not {short_repr(env)}"
+            f"save_episode needs an environment of one simulation, not {short_repr(env)}. Of the"
+            " environment that a policy is given, it saves branches and clones, but not in"
+            " simulate_many and in vector environments: simulate has the same episode"
         )
     session = view.session
     recording = session.recording()
     if view.episode.pending is None and not view.episode.over:
         raise session.refusal()
-    lines = [
-        head_of(recipe_of(session.plan, unnamed), view.kind, recording.seed, recording.options)
-    ]
+    lines = [head_of(recipe_of(session.plan, unnamed), kind, recording.seed, recording.options)]
     file = getattr(getattr(session.episode, "tape", None), "path", None)
-    if file is not None and file.exists():  # with ``record=``
+    is_own = session.where is Where.USER and not isinstance(view, PlannerEnv)  # not its parent's
+    if is_own and file is not None and file.exists():  # with ``record=``
         lines += [line for number, line in Lines(file).read() if number > 1]
         if all(line.keys().isdisjoint(("end", "error")) for line in lines):
             lines.append(end_of(view.episode))
@@ -104,14 +120,14 @@ def _repeated(view: Any, recording: Recording) -> list[Json]:
     """Return the lines of an episode, which another simulation repeats."""
     lines: list[Json] = []
     session = Session(view.session.plan)
-    twin = VIEWS[view.kind].of_session(session)
+    twin = type(view).of_session(session)
     replay = Replay(recording.tape)
     session.make_tapes(partial(FileTape, put=lines.append), replay)
     error = None
     try:
         with preserve_generators():  # because the model may draw from these
             try:
-                _repeat(twin, recording.seed, recording.options, replay)
+                _repeat(twin, recording.seed, recording.options, replay, recording.in_rounds)
                 while view.kind == "aec" and twin.agents != view.agents:
                     twin.step(None)
             except Exception as problem:
@@ -137,9 +153,12 @@ def _repeated(view: Any, recording: Recording) -> list[Json]:
     return lines
 
 
-def _repeat(view: Any, seed: int, options: Any, replay: Replay) -> None:
+def _repeat(view: Any, seed: int, options: Any, replay: Replay, in_rounds: bool) -> None:
     """Repeat the episode of a replay in a view."""
-    view.reset(seed=seed, options=options)
+    if isinstance(view, PlannerEnv):
+        view.repeat_branch(seed, options, replay, in_rounds)
+    else:
+        view.reset(seed=seed, options=options)
     while replay and replay[0] is not GO_ON:
         answer = replay.popleft()
         if isinstance(answer, Reseeded):
@@ -211,7 +230,8 @@ def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> st
     file = EpisodeFile(path, until)
     timeline: list[str] = []
     view = file.load(timeline=timeline)
-    head = f"{view.session.plan.name}, view {view.kind}, seed {view.session.seed}"
+    kind = f"{file.head['view']}, in a branch" if file.is_branch else view.kind
+    head = f"{view.session.plan.name}, view {kind}, seed {view.session.seed}"
     timeline.append(f"now: {_shown(end_of(view.episode))}")
     view.close()
     return "\n".join((head, *timeline))
@@ -242,11 +262,14 @@ class EpisodeFile:
         number = 1
         try:
             self.head = episode.head | {"reset": decode_value(episode.head.get("reset"))}
-            self._view = VIEWS[self.head["view"]]
+            view = None if self.head["view"] == SIMULATE else VIEWS[self.head["view"]]
             if self.head["episode"] != FORMAT or not isinstance(self.head["versions"], dict):
                 raise ValueError("it is of another version")
             for number, line in episode.present:
                 self._take(number, {**line})
+            if view is None and not self.is_branch:
+                raise ValueError("it has no view")
+            self._view = view
         except Exception as error:
             raise malformed(path, number) from error
         if "error" in self._last:
@@ -259,6 +282,8 @@ class EpisodeFile:
         line.pop("play", None)
         if "reseed" in line:
             answer: Action = Reseeded(line["reseed"])
+        elif "branch" in line:
+            answer = Branched(line["branch"])
         elif "exit" in line:
             answer = _EXIT
         elif "action" in line and not self._last:
@@ -271,6 +296,22 @@ class EpisodeFile:
         self._numbers.append(number)
         self.lines.append(line)
         self.answers.append(answer)
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch of a planner."""
+        return any(isinstance(answer, Branched) for answer in self.answers)
+
+    def _make(self, *arguments: Any) -> Any:
+        """Make the environment, before its episode."""
+        if self._view is None:
+            session = Session(plan_of(*arguments, mode=Mode.SIMULATE))
+        else:
+            view = self._view(plan_of(*arguments))
+            if not self.is_branch:
+                return view
+            session = view.hand_over()
+        return PlannerEnv.of_session(session, owned=True)
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
@@ -319,7 +360,7 @@ class EpisodeFile:
         **options: Unpack[ViewOptions],
     ) -> Any:
         """Make the environment. ``timeline`` gets a text for each repeated decision."""
-        view = self._view(plan_of(*self.arguments(simulation, points, **options)))
+        view = self._make(*self.arguments(simulation, points, **options))
         try:
             problem = self._replay(view, timeline)
             if problem is not None:  # the process was killed before it could write that
@@ -336,7 +377,7 @@ class EpisodeFile:
         """Bring the environment to the last line. Return the error of an answer at the very end."""
         session = view.session
         plan = session.plan
-        is_recorded = plan.options.record is not None
+        is_recorded = plan.options.record is not None and not self.is_branch
         make_tape = recorder(plan, view.kind) if is_recorded else FileTape
         expected = deque(zip(self._numbers, self.lines, self.answers, strict=True))
 
@@ -365,7 +406,8 @@ class EpisodeFile:
         replay = Replay([*self.answers, GO_ON])
         session.make_tapes(make, replay)
         try:
-            _repeat(view, self.head["seed"], self.head["reset"], replay)
+            in_rounds = self._view is not None and self._view.in_rounds
+            _repeat(view, self.head["seed"], self.head["reset"], replay, in_rounds)
         except EpisodeFileError:
             raise
         except Exception as error:

@@ -10,7 +10,7 @@ from typing import Any
 from uuid import uuid4
 from weakref import ref
 
-from ..core import Action, Agent, EpisodeState, Plan, Reseeded, Session, Tape
+from ..core import Action, Agent, Branched, EpisodeState, Plan, Reseeded, Session, Tape
 from ..errors import StoreError, describe_error
 from .lines import Lines
 from .recipes import FORMAT, Json, recipe_of
@@ -74,9 +74,13 @@ class FileTape(Tape):
         episode = self._episode()
         if episode is None:
             return
-        if type(answer) is Reseeded:
-            self._pass_on({"reseed": answer.seed})
-            return
+        match answer:
+            case Reseeded():
+                self._pass_on({"reseed": answer.seed})
+                return
+            case Branched():
+                self._pass_on({"branch": answer.agent})
+                return
         line = decision_of(episode, episode.latest)
         if episode.latest.delegated:
             line["by"] = "policy"

@@ -49,12 +49,14 @@ class Snapshot(NamedTuple):
         seed: The seed of the latest episode.
         np_random_seed: The seed of the generator.
         np_random: The generator.
+        kind: The view.
     """
 
     state: State
     seed: int | None
     np_random_seed: int | None
     np_random: np.random.Generator | None
+    kind: str
 
 
 class PendingDecision(NamedTuple):
@@ -92,6 +94,13 @@ class Reseeded:
     """On a tape: here the simulation was reseeded."""
 
     seed: int
+
+
+@dataclass(frozen=True)
+class Branched:
+    """On a tape: here a planner's branch begins, which waits for one agent alone."""
+
+    agent: str
 
 
 class Tape(list[Action]):
@@ -133,6 +142,7 @@ class BaseSession(ABC):
         where: Whether it belongs to the user, a clone or a branch.
         seed: The seed of the latest episode.
         options: The options of the latest reset.
+        kind: The view that its user has. Empty without one, and in vector environments.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
         exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
         lock: The same lock, if steps need it, too. None if only the thread that began an episode
@@ -144,6 +154,7 @@ class BaseSession(ABC):
     _state: State = State.NEW
     seed: int | None = None
     options: ResetOptions = None
+    kind: str = ""
     np_random_seed: int | None = None
     _np_random: np.random.Generator | None = None
     exclusive: ExclusiveLock = field(default_factory=ExclusiveLock)
@@ -173,11 +184,11 @@ class BaseSession(ABC):
         """Return the record for a copy."""
         has_decision = self.episode is not None and self.episode.pending is not None
         state = State.COPIED if has_decision else State.NEW
-        return Snapshot(state, self.seed, self.np_random_seed, self._np_random)
+        return Snapshot(state, self.seed, self.np_random_seed, self._np_random, self.kind)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Take over the record of another session."""
-        self._state, self.seed, self.np_random_seed, self._np_random = snapshot
+        self._state, self.seed, self.np_random_seed, self._np_random, self.kind = snapshot
 
     def refusal(self) -> SimEnvError:
         """Make the error that says why no action can be taken now."""

@@ -51,7 +51,7 @@ from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
-from .base import GO_ON, LONGEST_TAPE, EpisodeOwner, Replay, Tape
+from .base import GO_ON, LONGEST_TAPE, Branched, EpisodeOwner, Replay, Tape
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
 from .steps import Round, Team
@@ -362,7 +362,7 @@ class Episode(EpisodeState):
         if self.replay and self.replay[0] is GO_ON:
             self.replay = None
         if self.replay is not None:
-            if not self.replay:  # the other episode stands here
+            if not self.replay or isinstance(self.replay[0], Branched):  # the other one stands here
                 self.consulted = self.pending = agent
                 return WAIT
             action = self.replay.popleft()
@@ -560,8 +560,7 @@ class Episode(EpisodeState):
         """In a branch, wait for one agent alone. Policies answer for the others, else the rule."""
         self.plan = self.plan.for_one(agent.name)
         self.move_to(Where.BRANCH)
-        self.tape = Tape()  # it cannot be replayed, because this is not on the tape
-        self._tape_size = 0
+        self.record(Branched(agent.name))
         for name, other in self.agents.items():
             if other is not agent:
                 self._most_steps = maxsize  # ``max_steps`` counts the steps of other agents
@@ -589,6 +588,8 @@ class Episode(EpisodeState):
             name: two_arguments(policy_for(policies, name, self.where)) for name in names
         }
         self.plan = self.plan.with_policies(substitutes)
+        self.tape = Tape()  # it cannot be replayed, because these are not on the tape
+        self._tape_size = 0
         for name, agent in self.others.items():
             substitute = substitutes.get(name, substitutes.get(EVERYONE, RULE))
             if agent.policy is RULE and substitute is not RULE:

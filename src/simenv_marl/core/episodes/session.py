@@ -34,8 +34,10 @@ from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.spaces import same
 from .agent import Clock
 from .base import (
+    GO_ON,
     LONGEST_TAPE,
     BaseSession,
+    Branched,
     PendingDecision,
     Recording,
     Replay,
@@ -61,21 +63,28 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_defined", "_driver", "_homes", "_installed", "_make_tape", "_replay",
-        "_reset", "_rng", "_simulation", "context", "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_defined", "_driver", "_homes", "_in_rounds", "_installed",
+        "_make_tape", "_replay", "_reset", "_rng", "_simulation", "context", "episode", "handlers",
+        "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
     handlers: Handlers
     _driver: Driver
 
-    def __init__(self, plan: Plan, unmatched_names: UnmatchedNames | None = None) -> None:
+    def __init__(
+        self, plan: Plan, unmatched_names: UnmatchedNames | None = None, *, kind: str = ""
+    ) -> None:
         """Make the simulation, and set the plan's decision functions in the model.
 
-        ``unmatched_names``: shared by sessions that run side by side.
+        Args:
+            plan: The plan.
+            unmatched_names: Is shared by sessions that run side by side.
+            kind: The view.
         """
-        super().__init__(plan, Where.USER)
+        super().__init__(plan, Where.USER, kind=kind)
         self.episode = None
+        self._in_rounds = False  # at the beginning of the episode
         self._make_tape: Callable[[Session], Tape] | None = None
         self._replay: Replay | None = None
         self.unmatched_names = unmatched_names or UnmatchedNames(plan.named_agents)
@@ -171,6 +180,7 @@ class Session(BaseSession):
                     self._installed = Installation(self.plan.patches)
                 self._warn_of_outdated()
                 self.options = options
+                self._in_rounds = in_rounds
                 self.seed = self.seed_for(seed)
                 if replay is None:
                     replay, self._replay = self._replay, None
@@ -388,14 +398,13 @@ class Session(BaseSession):
             raise self.refusal()
         if not episode.is_recorded:
             raise BranchError(
-                f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of"
-                " the environment that a policy is given, so its actions were not kept; use"
-                ' method="fork"'
+                f"the episode has more than {LONGEST_TAPE:,} decisions, or is a branch in which a"
+                ' base decides for others, so its actions were not kept; use method="fork"'
             )
         return Recording(
             episode.seed,
             self.options,
-            episode.in_rounds,
+            self._in_rounds,
             [*episode.tape],
             _pending_decision(episode),
         )
@@ -413,11 +422,7 @@ class Session(BaseSession):
             recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
         )
         while replay:
-            answer = replay.popleft()
-            if isinstance(answer, Reseeded):
-                self.reseed(answer.seed)
-            else:
-                episode.step(answer)
+            self.repeat(replay)
         episode.end_replay()
         if original.episode is not None:
             episode.remember(original.episode)
@@ -430,6 +435,21 @@ class Session(BaseSession):
             )
         state = self._state
         self.restore(copy.deepcopy(original.snapshot())._replace(state=state))
+
+    def repeat(self, replay: Replay) -> None:
+        """Repeat the user's answers, up to the beginning of a branch, or to the end."""
+        episode = self.episode
+        while replay and replay[0] is not GO_ON and episode is not None:
+            answer = replay.popleft()
+            if isinstance(answer, Reseeded):
+                self.reseed(answer.seed)
+            elif isinstance(answer, Branched):
+                if episode.deciding is None:
+                    raise episode.refusal()
+                episode.single_out(episode.deciding)
+                return
+            else:
+                episode.step(answer)
 
     # -- branches ---------------------------------------------------------------------------------
 

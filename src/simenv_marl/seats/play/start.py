@@ -144,6 +144,8 @@ def open_game(path: Path, until: int | None, rules: Rules) -> tuple[Game, Rules]
         StoreError: It cannot be read.
     """
     file = EpisodeFile(path, until)
+    if file.is_branch:
+        raise EpisodeFileError(f"no game can go on from {path}: it is the branch of a planner")
     view = file.load()  # verifies it in its own view
     pending = end_of(view.episode)
     simulation, points, options = file.arguments()

@@ -19,7 +19,7 @@ from collections import deque
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Unpack
+from typing import Any, Final, NamedTuple, Unpack
 from uuid import uuid4
 
 from .core import (
@@ -159,14 +159,9 @@ def _repeat(view: Any, seed: int, options: Any, replay: Replay, in_rounds: bool)
         view.repeat_branch(seed, options, replay, in_rounds)
     else:
         view.reset(seed=seed, options=options)
-    while replay and replay[0] is not GO_ON:
-        answer = replay.popleft()
-        if isinstance(answer, Reseeded):
-            view.session.reseed(answer.seed)
-        elif answer is _EXIT:
-            view.step(None)
-        else:
-            view.repeat(answer)
+    view.session.repeat(
+        replay, lambda answer: view.step(None) if answer is _EXIT else view.repeat(answer)
+    )
 
 
 def _write(path: Path, lines: list[Json]) -> None:
@@ -237,12 +232,24 @@ def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> st
     return "\n".join((head, *timeline))
 
 
+class Answered(NamedTuple):
+    """A line of a file: its number, itself without the action, and the answer."""
+
+    number: int
+    line: Json
+    answer: Action
+
+    @property
+    def is_by_user(self) -> bool:
+        """Whether the user has answered a decision."""
+        return "agent" in self.line and "by" not in self.line
+
+
 class EpisodeFile:
     """The last episode of a file, up to the decision that pends there.
 
     Attributes:
         head: The first line.
-        lines: The lines of the answers, without the actions.
         answers: The answers.
     """
 
@@ -255,21 +262,17 @@ class EpisodeFile:
         """
         self._path = path
         episode = read_episodes(path)[-1]
-        self.lines: list[Json] = []
-        self.answers: list[Action] = []
-        self._numbers: list[int] = []
+        self.answers: list[Answered] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
         number = 1
         try:
             self.head = episode.head | {"reset": decode_value(episode.head.get("reset"))}
-            view = None if self.head["view"] == SIMULATE else VIEWS[self.head["view"]]
+            kind = self.head["view"]
+            self._view = None if kind == SIMULATE else VIEWS[kind]
             if self.head["episode"] != FORMAT or not isinstance(self.head["versions"], dict):
                 raise ValueError("it is of another version")
             for number, line in episode.present:
                 self._take(number, {**line})
-            if view is None and not self.is_branch:
-                raise ValueError("it has no view")
-            self._view = view
         except Exception as error:
             raise malformed(path, number) from error
         if "error" in self._last:
@@ -293,49 +296,46 @@ class EpisodeFile:
             return
         else:
             raise ValueError("it is no line of an answer")
-        self._numbers.append(number)
-        self.lines.append(line)
-        self.answers.append(answer)
+        self.answers.append(Answered(number, line, answer))
 
     @property
     def is_branch(self) -> bool:
         """Whether it is a branch of a planner."""
-        return any(isinstance(answer, Branched) for answer in self.answers)
+        return any("branch" in line for _, line, _ in self.answers)
 
     def _make(self, *arguments: Any) -> Any:
         """Make the environment, before its episode."""
-        if self._view is None:
-            session = Session(plan_of(*arguments, mode=Mode.SIMULATE))
-        else:
+        if self._view is not None:
             view = self._view(plan_of(*arguments))
             if not self.is_branch:
                 return view
             session = view.hand_over()
+        elif self.is_branch:
+            session = Session(plan_of(*arguments, mode=Mode.SIMULATE))
+        else:
+            raise malformed(self._path, 1)
         return PlannerEnv.of_session(session, owned=True)
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
         self._last = {}
-        self._leave_out(max(self._places(), default=len(self.answers)))
-
-    def _places(self) -> list[int]:
-        """Return the places of the user's answers."""
-        lines = enumerate(self.lines)
-        return [place for place, line in lines if "agent" in line and "by" not in line]
+        places = [place for place, each in enumerate(self.answers) if each.is_by_user]
+        for place in places[-1:]:
+            self._leave_out(place)
 
     def _stop_at(self, until: int) -> None:
         """Leave out the user's next answer after so many decisions, and whatever follows it."""
-        decisions = [place for place, line in enumerate(self.lines) if "agent" in line]
-        if until < len(decisions):
-            later = [place for place in self._places() if place >= decisions[until]]
-            self._leave_out(min(later, default=len(self.answers)))
+        decisions = 0
+        for place, each in enumerate(self.answers):
+            if each.is_by_user and decisions >= until:
+                self._leave_out(place)
+                return
+            decisions += "agent" in each.line
 
     def _leave_out(self, place: int) -> None:
         """Leave out an answer, and whatever follows it."""
-        if place < len(self.answers):
-            self._last = self.lines[place]
-            for items in (self.lines, self.answers, self._numbers):
-                del items[place:]
+        self._last = self.answers[place].line
+        del self.answers[place:]
 
     def arguments(
         self, simulation: Model = None, points: Points = None, **options: Unpack[ViewOptions]
@@ -379,18 +379,18 @@ class EpisodeFile:
         plan = session.plan
         is_recorded = plan.options.record is not None and not self.is_branch
         make_tape = recorder(plan, view.kind) if is_recorded else FileTape
-        expected = deque(zip(self._numbers, self.lines, self.answers, strict=True))
+        end = Answered(1 + max((each.number for each in self.answers), default=1), self._last, None)
+        expected = deque([*self.answers, end])
 
-        def differ(recorded: Json, line: Json) -> EpisodeFileError:
-            number = expected[0][0] if expected else [1, *self._numbers][-1] + 1
-            return self._difference(plan, number, recorded, line)
+        def differ(line: Json) -> EpisodeFileError:
+            return self._difference(plan, *expected[0][:2], line)
 
         def compare(line: Json) -> None:
-            if not expected:
+            if expected[0] is end:
                 return
-            if expected[0][1] != line:
-                raise differ(expected[0][1], line)
-            _, _, answer = expected.popleft()
+            if expected[0].line != line:
+                raise differ(line)
+            answer = expected.popleft().answer
             if timeline is not None and "agent" in line:
                 agent = session.episode.latest
                 time = "" if agent.now is None else f"  at {agent.now:g}"
@@ -403,7 +403,7 @@ class EpisodeFile:
             tape.compare(compare)
             return tape
 
-        replay = Replay([*self.answers, GO_ON])
+        replay = Replay([*(each.answer for each in self.answers), GO_ON])
         session.make_tapes(make, replay)
         try:
             in_rounds = self._view is not None and self._view.in_rounds
@@ -413,14 +413,13 @@ class EpisodeFile:
         except Exception as error:
             if not self._last and (not replay or replay[0] is GO_ON):
                 return error
-            recorded = expected[0][1] if expected else self._last
-            raise differ(recorded, {"error": describe_error(error)}) from error
+            raise differ({"error": describe_error(error)}) from error
         finally:
             session.make_tapes(make_tape if is_recorded else None)
         view.episode.tape.compare(None)
         line = end_of(view.episode)
         if self._last and line != self._last:
-            raise differ(self._last, line)
+            raise differ(line)
         return None
 
     def _difference(self, plan: Plan, number: int, recorded: Json, line: Json) -> EpisodeFileError:

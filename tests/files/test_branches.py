@@ -19,6 +19,7 @@ from simenv_marl import (
     turn_env,
     vector_env,
 )
+from simenv_marl.episodes import replay_episode
 from simenv_marl.errors import BranchError, EpisodeFileError, ViewError
 from simenv_marl.planning import action_values
 from simenv_marl.seats.play.host import Rules
@@ -194,3 +195,20 @@ def test_no_game_goes_on_from_a_branch(at_third, tmp_path):
     at_third(lambda env: branch(env, partial(step, path=tmp_path / "a")), RUNS["aec"])
     with pytest.raises(EpisodeFileError, match="branch of a planner"):
         open_game(tmp_path / "a", None, Rules(""))
+
+
+def test_a_file_of_a_branch_is_shown_up_to_its_decisions(at_third, tmp_path):
+    at_third(lambda env: branch(env, partial(step, path=tmp_path / "a")), RUNS["simulate"])
+    target.update(seen=[])
+    head, *decisions, now = replay_episode(tmp_path / "a").splitlines()
+    assert head == "Pumps, view simulate, in a branch, seed 3"
+    assert [line.split()[1].strip(":") for line in decisions][-2:] == ["pull", "push"]
+    assert now == "now: a decision of 'pull'"
+    shorter = replay_episode(tmp_path / "a", len(decisions) - 2)
+    assert shorter.splitlines()[1:-1] == decisions[:-2]
+    at_once = replay_episode(tmp_path / "a", 0)  # the policies before the branch are repeated
+    assert at_once.splitlines()[1:] == [*decisions[:5], "now: a decision of 'pull'"]
+    lines = (tmp_path / "a").read_text().splitlines()
+    (tmp_path / "a").write_text("\n".join(line for line in lines if '"branch"' not in line))
+    with pytest.raises(EpisodeFileError, match="line 1 of"):
+        load_episode(tmp_path / "a")

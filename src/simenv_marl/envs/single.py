@@ -255,8 +255,8 @@ class PlannerEnv(SimulationEnv):
         """
         self.is_branch = True
         session = self.session
-        session.start(seed, options, in_rounds=rounds)
-        session.repeat(replay)
+        episode = session.start(seed, options, in_rounds=rounds)
+        session.repeat(replay, episode.step)
         self.set_up()
         self._latest = self.own_agent.hand_out(), self.own_agent.info
 

@@ -41,10 +41,16 @@ class Lines:
 
         They begin on a new line, also where a crash or a full disk has torn the last one.
         """
-        text = b"".join(map(to_line, values))
+        self._write(b"".join(map(to_line, values)), mends=True)
+
+    def add(self, value: Any) -> None:
+        """Append a line to a file that only this object writes."""
+        self._write(to_line(value))
+
+    def _write(self, text: bytes, mends: bool = False) -> None:
         file = os.open(self._name, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
         try:
-            if os.lseek(file, 0, os.SEEK_END):
+            if mends and os.lseek(file, 0, os.SEEK_END):
                 os.lseek(file, -1, os.SEEK_END)
                 text = text if os.read(file, 1) == b"\n" else b"\n" + text
             os.write(file, text)

@@ -45,16 +45,18 @@ class EpisodeLines:
         Raises:
             ValueError: It does not follow from those before it.
         """
-        is_move = line.keys() == {"turn"}
-        turn = line["turn"] if is_move else line.get("play", {}).get("turn", self.turn)
+        turn = line.get("turn", self.turn)
+        if "play" in line:
+            turn = line["play"].get("turn", turn)
         if not 0 <= turn <= len(self._places):
             raise ValueError(f"the decision before turn {turn} is missing")
         self.turn = turn
-        if is_move:
+        if "turn" in line:
             return
         if "action" in line:
-            self.lines = self.present
-            del self._places[turn:]
+            if turn < len(self._places):
+                self.lines = self.present
+                del self._places[turn:]
             self._places.append(len(self.lines))
             self.turn += 1
         self.lines.append((number, line))
@@ -86,7 +88,8 @@ def read_episodes(path: str | os.PathLike[str]) -> list[EpisodeLines]:
     try:
         for number, value in Lines(path).read():
             expected += 1
-            for line in _renewed(value):
+            is_old = "turn" in value or "simulation" in value
+            for line in _renewed(value) if is_old else (value,):
                 follow(episodes, number, line)
             # A game is resumed after a crash, and the turns of its lines fit together.
             if number != expected and "play" not in episodes[-1].head:
@@ -107,7 +110,7 @@ def malformed(path: str | os.PathLike[str], number: int) -> EpisodeFileError:
 
 def _renewed(line: Json) -> Iterator[Json]:
     """Yield a line, or those in place of one of a game of an older version."""
-    if "seed" in line and "episode" not in line and "simulation" in line:
+    if "seed" in line and "episode" not in line:
         game = {name: line.pop(name) for name in ("simulation", "seats") if name in line}
         yield {"seed": line.pop("seed"), "play": game, "options": line}
     elif "agent" in line and "turn" in line:

@@ -74,13 +74,10 @@ class FileTape(Tape):
         episode = self._episode()
         if episode is None:
             return
-        match answer:
-            case Reseeded():
-                self._pass_on({"reseed": answer.seed})
-                return
-            case Branched():
-                self._pass_on({"branch": answer.agent})
-                return
+        kind = type(answer)
+        if kind is Reseeded or kind is Branched:
+            self._pass_on({"reseed": answer.seed} if kind is Reseeded else {"branch": answer.agent})
+            return
         line = decision_of(episode, episode.latest)
         if episode.latest.delegated:
             line["by"] = "policy"
@@ -142,10 +139,10 @@ class Recorder(FileTape):
         """Begin the file of a session's next episode."""
         seed = session.seed or 0
         self.path = folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{seed}-{uuid4().hex[:8]}.jsonl"
-        append = Lines(str(self.path)).append
-        super().__init__(session, append)
+        add = Lines(self.path).add
+        super().__init__(session, add)
         self._keeps: bool | None = session.plan.options.record_all  # None: its end is written
-        append(head_of(recipe, view, seed, session.options))
+        add(head_of(recipe, view, seed, session.options))
 
     def end(self, error: BaseException | None = None) -> str:
         """Finish the file after an error, or if all are kept. Else remove it."""

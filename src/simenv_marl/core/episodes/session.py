@@ -25,7 +25,7 @@ from ...errors import (
 )
 from ...hooks.handlers import Installation
 from ...hooks.places import homes_of, is_outdated
-from ...simulation import Model, make_simulation, optional_method, passing, takes
+from ...simulation import Action, Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -422,7 +422,7 @@ class Session(BaseSession):
             recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
         )
         while replay:
-            self.repeat(replay)
+            self.repeat(replay, episode.step)
         episode.end_replay()
         if original.episode is not None:
             episode.remember(original.episode)
@@ -436,20 +436,19 @@ class Session(BaseSession):
         state = self._state
         self.restore(copy.deepcopy(original.snapshot())._replace(state=state))
 
-    def repeat(self, replay: Replay) -> None:
-        """Repeat the user's answers, up to the beginning of a branch, or to the end."""
-        episode = self.episode
-        while replay and replay[0] is not GO_ON and episode is not None:
+    def repeat(self, replay: Replay, step: Callable[[Action], object]) -> None:
+        """Repeat the user's answers by ``step``, up to the beginning of a branch, or to the end."""
+        while replay and replay[0] is not GO_ON:
             answer = replay.popleft()
             if isinstance(answer, Reseeded):
                 self.reseed(answer.seed)
-            elif isinstance(answer, Branched):
-                if episode.deciding is None:
-                    raise episode.refusal()
-                episode.single_out(episode.deciding)
+            elif isinstance(answer, Branched) and self.episode is not None:
+                if self.episode.deciding is None:
+                    raise self.episode.refusal()
+                self.episode.single_out(self.episode.deciding)
                 return
             else:
-                episode.step(answer)
+                step(answer)
 
     # -- branches ---------------------------------------------------------------------------------
 

@@ -181,7 +181,7 @@ def repeat(game: Game, file: EpisodeFile, pending: Json) -> None:
     """
     decisions: deque[tuple[Json, Action]] = deque()
     deciders = {pending.get("agent")}
-    for line, answer in zip(file.lines, file.answers, strict=True):
+    for _, line, answer in file.answers:
         if "reseed" in line:
             raise InvalidActionError("its chance was drawn anew in a clone")
         if "agent" in line:

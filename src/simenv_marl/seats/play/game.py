@@ -184,8 +184,9 @@ class Game:
 
     def _head(self) -> Json:
         """Return the first line of the episode."""
-        # What has no name is given again by whoever loads the file.
-        recipe = recipe_of(self.root.session.plan, unnamed=True)
+        recipe: Json = {}
+        if self.record is not None:  # whoever loads the file gives again what has no name
+            recipe = recipe_of(self.root.session.plan, unnamed=True)
         game = {"simulation": self.name, "seats": list(self.seats)}
         return head_of(recipe, self.root.kind, self.seed, self.reset) | {"play": game}
 

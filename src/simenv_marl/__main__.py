@@ -106,7 +106,13 @@ def _play(
     return start(make, **options)
 
 
-def _replay(file: Path, until: int | None) -> str:
+def _replay(file: Path, until: int | None, play: bool, port: int) -> str:
+    if play:
+        from .seats.play.host import Rules
+        from .seats.play.start import open_game, start
+
+        make = partial(open_game, file, until, Rules(""))
+        return start(make, host="127.0.0.1", port=port, record=None)
     from .episodes import replay_episode
 
     return replay_episode(file, until)
@@ -188,6 +194,14 @@ _SIMULATION: Final[_Arguments] = {
 _AS_JSON: Final[_Arguments] = {
     "--json": {"action": "store_true", "help": "print JSON instead of text"},
 }
+_PORT: Final[_Arguments] = {
+    "--port": {
+        "type": int,
+        "default": 8000,
+        "metavar": "P",
+        "help": "where to serve it; 0: any free port (default: 8000)",
+    },
+}
 _RUN: Final[_Arguments] = {
     **_SIMULATION,
     "--points": {
@@ -263,12 +277,7 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., object], str, _Arguments]]] = {
                 "metavar": "N",
                 "help": "the seed of the first episode (default: a random one)",
             },
-            "--port": {
-                "type": int,
-                "default": 8000,
-                "metavar": "P",
-                "help": "where to serve it; 0: any free port (default: 8000)",
-            },
+            **_PORT,
             "--host": {
                 "default": "127.0.0.1",
                 "help": "the address to listen on (default: 127.0.0.1, for this machine alone)",
@@ -316,18 +325,23 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., object], str, _Arguments]]] = {
     ),
     "replay": (
         _replay,
-        "repeat the episode of a file, and show its decisions",
+        "repeat the episode of a file, and show its decisions or go on from there",
         {
             "file": {
                 "type": Path,
                 "metavar": "FILE",
-                "help": "a file of save_episode, or of the option record",
+                "help": "a file of save_episode, of the option record, or of `play --record`",
             },
             "--until": {
                 "type": int,
                 "metavar": "N",
                 "help": "stop after N decisions (default: all of the file)",
             },
+            "--play": {
+                "action": "store_true",
+                "help": "serve a page on which people go on from there",
+            },
+            **_PORT,
         },
     ),
     "wire-check": (

@@ -19,11 +19,14 @@ from collections import deque
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Unpack
+from typing import Any, Final, NamedTuple, Unpack
 from uuid import uuid4
 
 from .core import (
     GO_ON,
+    Branched,
+    DeferredPolicy,
+    Mode,
     Model,
     Plan,
     Points,
@@ -32,11 +35,12 @@ from .core import (
     Reseeded,
     Session,
     ViewOptions,
+    Where,
     preserve_generators,
     same,
 )
 from .envs import VIEWS
-from .envs.single import plan_of
+from .envs.single import PlannerEnv, plan_of
 from .errors import (
     EpisodeFileError,
     SimEnvError,
@@ -46,11 +50,15 @@ from .errors import (
     describe_error,
     short_repr,
 )
-from .files.lines import Lines
+from .files.lines import Lines, to_line
+from .files.reader import malformed, read_episodes
 from .files.recipes import FORMAT, Json, arguments_of, changes_since, recipe_of
-from .files.tapes import FileTape, end_of, head_of, recorder, to_text
+from .files.tapes import FileTape, end_of, head_of, recorder
 from .files.values import decode_value
 from .simulation import Action, Sentinel
+
+SIMULATE: Final = "simulate"
+"""In place of the view, in a file of a branch of an episode without a user."""
 
 _EXIT: Final = Sentinel("EXIT")
 """Among answers: the ``None`` step of an agent that has ended."""
@@ -64,7 +72,8 @@ def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = Fals
 
     Args:
         env: An environment of one simulation, in any view, with or without wrappers, which are not
-            written; also a clone. A decision is pending, or the episode has ended.
+            written; also a clone, or a branch in a policy. A decision is pending, or the episode
+            has ended.
         path: The file. An existing one is replaced.
         unnamed: Whether to leave open whatever has no dotted name, such as a lambda. It must then
             be given to ``load_episode``.
@@ -72,25 +81,33 @@ def save_episode(env: Any, path: str | os.PathLike[str], *, unnamed: bool = Fals
     Raises:
         EpisodeFileError: Something has no name, an action or an option is no data, or the
             simulation does not repeat the episode. Nothing is written.
-        ViewError: It is not an environment of one simulation, or is one that a policy is given.
+        ViewError: It is not an environment of one simulation, or is one that a policy is given and
+            is no branch or clone yet.
         ResetNeededError: There is no episode.
         BranchError: The episode has no complete tape.
         StoreError: The file cannot be written.
     """
     view = getattr(env, "unwrapped", env)
-    if getattr(view, "kind", "") not in VIEWS:
+    kind = getattr(view, "kind", "")
+    if isinstance(view, PlannerEnv) and view.is_branch:
+        plan = view.session.plan
+        policies = (plan.options.policies or {}).values()
+        is_alone = not (plan.has_user or any(isinstance(each, DeferredPolicy) for each in policies))
+        kind = view.session.kind or (SIMULATE if is_alone else "")
+    if kind not in (*VIEWS, SIMULATE):
         raise ViewError(
-            f"save_episode needs an environment of one simulation, not {short_repr(env)}"
+            f"save_episode needs an environment of one simulation, not {short_repr(env)}. Of the"
+            " environment that a policy is given, it saves branches and clones, but not in"
+            " simulate_many and in vector environments: simulate has the same episode"
         )
     session = view.session
     recording = session.recording()
     if view.episode.pending is None and not view.episode.over:
         raise session.refusal()
-    lines = [
-        head_of(recipe_of(session.plan, unnamed), view.kind, recording.seed, recording.options)
-    ]
+    lines = [head_of(recipe_of(session.plan, unnamed), kind, recording.seed, recording.options)]
     file = getattr(getattr(session.episode, "tape", None), "path", None)
-    if file is not None and file.exists():  # with ``record=``
+    is_own = session.where is Where.USER and not isinstance(view, PlannerEnv)  # not its parent's
+    if is_own and file is not None and file.exists():  # with ``record=``
         lines += [line for number, line in Lines(file).read() if number > 1]
         if all(line.keys().isdisjoint(("end", "error")) for line in lines):
             lines.append(end_of(view.episode))
@@ -103,14 +120,14 @@ def _repeated(view: Any, recording: Recording) -> list[Json]:
     """Return the lines of an episode, which another simulation repeats."""
     lines: list[Json] = []
     session = Session(view.session.plan)
-    twin = VIEWS[view.kind].of_session(session)
+    twin = type(view).of_session(session)
     replay = Replay(recording.tape)
     session.make_tapes(partial(FileTape, put=lines.append), replay)
     error = None
     try:
         with preserve_generators():  # because the model may draw from these
             try:
-                _repeat(twin, recording.seed, recording.options, replay)
+                _repeat(twin, recording.seed, recording.options, replay, recording.in_rounds)
                 while view.kind == "aec" and twin.agents != view.agents:
                     twin.step(None)
             except Exception as problem:
@@ -136,25 +153,22 @@ def _repeated(view: Any, recording: Recording) -> list[Json]:
     return lines
 
 
-def _repeat(view: Any, seed: int, options: Any, replay: Replay) -> None:
+def _repeat(view: Any, seed: int, options: Any, replay: Replay, in_rounds: bool) -> None:
     """Repeat the episode of a replay in a view."""
-    view.reset(seed=seed, options=options)
-    while replay and replay[0] is not GO_ON:
-        answer = replay.popleft()
-        if isinstance(answer, Reseeded):
-            view.session.reseed(answer.seed)
-        elif answer is _EXIT:
-            view.step(None)
-        else:
-            view.repeat(answer)
+    if isinstance(view, PlannerEnv):
+        view.repeat_branch(seed, options, replay, in_rounds)
+    else:
+        view.reset(seed=seed, options=options)
+    view.session.repeat(
+        replay, lambda answer: view.step(None) if answer is _EXIT else view.repeat(answer)
+    )
 
 
 def _write(path: Path, lines: list[Json]) -> None:
     """Write lines to a file, which is never seen without some of them."""
-    text = "".join(f"{to_text(line)}\n" for line in lines)
     beside = path.with_name(f"{path.name}.{uuid4().hex[:8]}")
     try:
-        beside.write_bytes(text.encode(errors="surrogatepass"))
+        beside.write_bytes(b"".join(map(to_line, lines)))
         beside.replace(path)
     except OSError as error:
         with suppress(OSError):
@@ -194,7 +208,7 @@ def load_episode(
         StoreError: The file cannot be read.
         SimEnvError: Another argument is invalid.
     """
-    return _Loading(Path(path)).load(simulation, points, options)
+    return EpisodeFile(path).load(simulation, points, **options)
 
 
 def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> str:
@@ -208,59 +222,71 @@ def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> st
     Raises:
         SimEnvError: Any error of ``load_episode``.
     """
+    file = EpisodeFile(path, until)
     timeline: list[str] = []
-    loading = _Loading(Path(path), timeline)
-    if until is not None:
-        loading.stop_at(until)
-    view = loading.load(None, None, {})
-    head = f"{view.session.plan.name}, view {view.kind}, seed {view.session.seed}"
+    view = file.load(timeline=timeline)
+    kind = f"{file.head['view']}, in a branch" if file.is_branch else view.kind
+    head = f"{view.session.plan.name}, view {kind}, seed {view.session.seed}"
     timeline.append(f"now: {_shown(end_of(view.episode))}")
     view.close()
     return "\n".join((head, *timeline))
 
 
-class _Loading:
-    """A file that is being loaded."""
+class Answered(NamedTuple):
+    """A line of a file: its number, itself without the action, and the answer."""
 
-    def __init__(self, path: Path, timeline: list[str] | None = None) -> None:
-        """Read a file. ``timeline`` gets a text for each repeated decision."""
+    number: int
+    line: Json
+    answer: Action
+
+    @property
+    def is_by_user(self) -> bool:
+        """Whether the user has answered a decision."""
+        return "agent" in self.line and "by" not in self.line
+
+
+class EpisodeFile:
+    """The last episode of a file, up to the decision that pends there.
+
+    Attributes:
+        head: The first line.
+        answers: The answers.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], until: int | None = None) -> None:
+        """Read a file, up to so many decisions.
+
+        Raises:
+            EpisodeFileError: It is malformed.
+            StoreError: It cannot be read.
+        """
         self._path = path
-        self._timeline = timeline
-        try:
-            lines = [*Lines(path).read()]
-        except OSError as error:
-            raise StoreError(f"{path} cannot be read: {describe_error(error)}") from error
-        except RecursionError:
-            raise self._malformed(1) from None
-        self._lines: list[Json] = []  # those of answers, without the actions
-        self._answers: list[Action] = []
+        episode = read_episodes(path)[-1]
+        self.answers: list[Answered] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
-        number = 0
+        number = 1
         try:
-            for number, (place, line) in enumerate(lines, 1):
-                if number == 1:
-                    self._head = line | {"reset": decode_value(line.get("reset"))}
-                    self._view = VIEWS[line["view"]]
-                else:
-                    self._take(line)
-                if place != number:
-                    raise ValueError("there is a torn line before it")
-            if self._head["episode"] != FORMAT or not isinstance(self._head["versions"], dict):
+            self.head = episode.head | {"reset": decode_value(episode.head.get("reset"))}
+            kind = self.head["view"]
+            self._view = None if kind == SIMULATE else VIEWS[kind]
+            if self.head["episode"] != FORMAT or not isinstance(self.head["versions"], dict):
                 raise ValueError("it is of another version")
+            for number, line in episode.present:
+                self._take(number, {**line})
         except Exception as error:
-            raise self._malformed(number) from error
+            raise malformed(path, number) from error
         if "error" in self._last:
             self._cut()
+        if until is not None:
+            self._stop_at(until)
 
-    def _malformed(self, number: int) -> EpisodeFileError:
-        return EpisodeFileError(
-            f"line {number} of {self._path} is not what save_episode of this version writes"
-        )
-
-    def _take(self, line: Json) -> None:
+    def _take(self, number: int, line: Json) -> None:
         """Take a line after the first one."""
+        line.pop("play", None)
         if "reseed" in line:
             answer: Action = Reseeded(line["reseed"])
+        elif "branch" in line:
+            answer = Branched(line["branch"])
         elif "exit" in line:
             answer = _EXIT
         elif "action" in line and not self._last:
@@ -270,42 +296,76 @@ class _Loading:
             return
         else:
             raise ValueError("it is no line of an answer")
-        self._lines.append(line)
-        self._answers.append(answer)
+        self.answers.append(Answered(number, line, answer))
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch of a planner."""
+        return any("branch" in line for _, line, _ in self.answers)
+
+    def _make(self, *arguments: Any) -> Any:
+        """Make the environment, before its episode."""
+        if self._view is not None:
+            view = self._view(plan_of(*arguments))
+            if not self.is_branch:
+                return view
+            session = view.hand_over()
+        elif self.is_branch:
+            session = Session(plan_of(*arguments, mode=Mode.SIMULATE))
+        else:
+            raise malformed(self._path, 1)
+        return PlannerEnv.of_session(session, owned=True)
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
         self._last = {}
-        self.stop_at(max(self._places(), default=len(self._answers)))
+        places = [place for place, each in enumerate(self.answers) if each.is_by_user]
+        for place in places[-1:]:
+            self._leave_out(place)
 
-    def _places(self) -> list[int]:
-        """Return the places of the user's answers."""
-        lines = enumerate(self._lines[: len(self._answers)])
-        return [place for place, line in lines if "agent" in line and "by" not in line]
-
-    def stop_at(self, least: int) -> None:
-        """Leave out the user's next answer after so many answers, and whatever follows it."""
-        for place in self._places():
-            if place >= least:
-                self._last = self._lines[place]
-                del self._answers[place:]
+    def _stop_at(self, until: int) -> None:
+        """Leave out the user's next answer after so many decisions, and whatever follows it."""
+        decisions = 0
+        for place, each in enumerate(self.answers):
+            if each.is_by_user and decisions >= until:
+                self._leave_out(place)
                 return
+            decisions += "agent" in each.line
 
-    def load(self, simulation: Model, points: Points, options: ViewOptions) -> Any:
-        """Make the environment."""
+    def _leave_out(self, place: int) -> None:
+        """Leave out an answer, and whatever follows it."""
+        self._last = self.answers[place].line
+        del self.answers[place:]
+
+    def arguments(
+        self, simulation: Model = None, points: Points = None, **options: Unpack[ViewOptions]
+    ) -> tuple[Model, Points, dict[str, Any]]:
+        """Return the simulation, the points and the options.
+
+        Raises:
+            EpisodeFileError: The first line is malformed, or a name in it cannot be used.
+        """
         try:
-            arguments = arguments_of(self._head, simulation, points, dict(options))
+            return arguments_of(self.head, simulation, points, options)
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             if isinstance(error, SimEnvError):
                 raise
-            raise self._malformed(1) from error
-        plan = plan_of(*arguments)
-        view = self._view(plan)
+            raise malformed(self._path, 1) from error
+
+    def load(
+        self,
+        simulation: Model = None,
+        points: Points = None,
+        timeline: list[str] | None = None,
+        **options: Unpack[ViewOptions],
+    ) -> Any:
+        """Make the environment. ``timeline`` gets a text for each repeated decision."""
+        view = self._make(*self.arguments(simulation, points, **options))
         try:
-            problem = self._replay(view)
+            problem = self._replay(view, timeline)
             if problem is not None:  # the process was killed before it could write that
                 self._cut()
-                problem = self._replay(view)
+                problem = self._replay(view, None)
             if problem is not None:
                 raise problem
         except BaseException as error:
@@ -313,53 +373,53 @@ class _Loading:
             raise
         return view
 
-    def _replay(self, view: Any) -> Exception | None:
+    def _replay(self, view: Any, timeline: list[str] | None) -> Exception | None:
         """Bring the environment to the last line. Return the error of an answer at the very end."""
         session = view.session
         plan = session.plan
-        is_recorded = plan.options.record is not None
+        is_recorded = plan.options.record is not None and not self.is_branch
         make_tape = recorder(plan, view.kind) if is_recorded else FileTape
-        expected = deque(self._lines[: len(self._answers)])
+        end = Answered(1 + max((each.number for each in self.answers), default=1), self._last, None)
+        expected = deque([*self.answers, end])
 
-        def differ(recorded: Json, line: Json) -> EpisodeFileError:
-            number = 2 + len(self._answers) - len(expected)
-            return self._difference(plan, number, recorded, line)
+        def differ(line: Json) -> EpisodeFileError:
+            return self._difference(plan, *expected[0][:2], line)
 
         def compare(line: Json) -> None:
-            if expected and expected[0] != line:
-                raise differ(expected[0], line)
-            if expected and self._timeline is not None and "agent" in line:
+            if expected[0] is end:
+                return
+            if expected[0].line != line:
+                raise differ(line)
+            answer = expected.popleft().answer
+            if timeline is not None and "agent" in line:
                 agent = session.episode.latest
                 time = "" if agent.now is None else f"  at {agent.now:g}"
-                action = short_repr(self._answers[-len(expected)], 60)
+                action = short_repr(answer, 60)
                 by = ", by its policy" if "by" in line else ""
-                number = len(self._timeline) + 1
-                self._timeline.append(f"{number:6}{time}  {agent.name}: {action}{by}")
-            if expected:
-                expected.popleft()
+                timeline.append(f"{len(timeline) + 1:6}{time}  {agent.name}: {action}{by}")
 
         def make(session: Session) -> FileTape:
             tape = make_tape(session)
             tape.compare(compare)
             return tape
 
-        replay = Replay([*self._answers, GO_ON])
+        replay = Replay([*(each.answer for each in self.answers), GO_ON])
         session.make_tapes(make, replay)
         try:
-            _repeat(view, self._head["seed"], self._head["reset"], replay)
+            in_rounds = self._view is not None and self._view.in_rounds
+            _repeat(view, self.head["seed"], self.head["reset"], replay, in_rounds)
         except EpisodeFileError:
             raise
         except Exception as error:
             if not self._last and (not replay or replay[0] is GO_ON):
                 return error
-            recorded = expected[0] if expected else self._last
-            raise differ(recorded, {"error": describe_error(error)}) from error
+            raise differ({"error": describe_error(error)}) from error
         finally:
             session.make_tapes(make_tape if is_recorded else None)
         view.episode.tape.compare(None)
         line = end_of(view.episode)
         if self._last and line != self._last:
-            raise differ(self._last, line)
+            raise differ(line)
         return None
 
     def _difference(self, plan: Plan, number: int, recorded: Json, line: Json) -> EpisodeFileError:
@@ -369,7 +429,7 @@ class _Loading:
             names = {"seen": "the observation", "mask": "the mask of legal actions"}
             differing = [text for key, text in names.items() if recorded.get(key) != line.get(key)]
             problem = f"{' and '.join(differing) or 'the answerer'} of {_shown(line)} differs"
-        reasons = changes_since(self._head, plan) or [
+        reasons = changes_since(self.head, plan) or [
             "has the model changed? It may also iterate over a set of strings, draw from a global"
             " generator (global_rng=True), or have been recorded with other floats of another"
             " machine"
@@ -383,4 +443,4 @@ class _Loading:
 def _shown(line: Json) -> str:
     """Return a line of a decision, an end or an error as words."""
     decision = f"a decision of {line['agent']!r}" if "agent" in line else ""
-    return line.get("error") or decision or to_text(line)
+    return line.get("error") or decision or to_line(line).decode(errors="replace").strip()

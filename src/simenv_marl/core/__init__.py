@@ -19,6 +19,7 @@ from .episodes.agent import Agent
 from .episodes.base import (
     GO_ON,
     BaseSession,
+    Branched,
     Recording,
     Replay,
     Reseeded,
@@ -93,7 +94,7 @@ __all__ = [  # noqa: RUF022 - by subject
     "split_extras", "takes_info", "takes_state", "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
-    "GO_ON", "Outcome", "Recording", "Replay", "Reseeded", "Tape", "find_point",
+    "Branched", "GO_ON", "Outcome", "Recording", "Replay", "Reseeded", "Tape", "find_point",
     "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
     "unpack_outcome",
     # Values.

@@ -103,14 +103,20 @@ class View:
     def __init__(self, plan: Plan) -> None:
         """Make the view of a plan, with a new session."""
         super().__init__()
-        self._attach(Session(self.adapt(plan)), {})
+        self._attach(Session(self.adapt(plan), kind=self.kind), {})
 
     @classmethod
-    def of_session(cls, session: BaseSession) -> Self:
-        """Make the view of a session that its owner closes."""
+    def of_session(cls, session: BaseSession, *, owned: bool = False) -> Self:
+        """Make the view of a session, which its owner closes, or which ends with the view."""
         view = cls.__new__(cls)
-        view._attach(session, {}, owned=False)
+        view._attach(session, {}, owned=owned)
         return view
+
+    def hand_over(self) -> BaseSession:
+        """Return the session, which does not end with this view any more."""
+        if self._finalizer is not None:
+            self._finalizer.detach()
+        return self.session
 
     def _attach(
         self,

@@ -22,6 +22,8 @@ from ..core import (
     Observation,
     Plan,
     Points,
+    Replay,
+    Session,
     Space,
     make_plan,
 )
@@ -220,8 +222,9 @@ class PlannerEnv(SimulationEnv):
     of the agent, which can be stepped; policies or rules answer for all other agents.
     """
 
-    kind = ""  # files have the environment that the planner decides in
-    _branched = False  # whether it is a branch, or a clone
+    kind = ""  # files name the view in which the planner decides
+    session: Session
+    is_branch = False  # or a clone
 
     def set_up(self) -> None:
         """Find the agent whose planner is being asked."""
@@ -240,10 +243,22 @@ class PlannerEnv(SimulationEnv):
 
     def begin_branch(self) -> None:
         """Turn this environment into a branch that waits for the agent only."""
-        if not self._branched:
-            self._branched = True
+        if not self.is_branch:
+            self.is_branch = True
             self.session.leave_caller()
             self.episode.single_out(self.own_agent)
+
+    def repeat_branch(self, seed: int, options: ResetOptions, replay: Replay, rounds: bool) -> None:
+        """Repeat the episode of the environment, and begin the branch at the same decision.
+
+        ``rounds``: whether all agents are updated when a step of the environment returns.
+        """
+        self.is_branch = True
+        session = self.session
+        episode = session.start(seed, options, in_rounds=rounds)
+        session.repeat(replay, episode.step)
+        self.set_up()
+        self._latest = self.own_agent.hand_out(), self.own_agent.info
 
     def check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""
@@ -266,7 +281,7 @@ class PlannerEnv(SimulationEnv):
         super().close()
 
     def _check_branched(self) -> None:
-        if not self._branched:
+        if not self.is_branch:
             raise ReentrancyError(_REFUSAL)
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:

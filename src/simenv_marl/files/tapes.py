@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from functools import partial
-from json.encoder import c_make_encoder, encode_basestring  # type: ignore[attr-defined]
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 from weakref import ref
 
-from ..core import Action, Agent, EpisodeState, Plan, Reseeded, Session, Tape
+from ..core import Action, Agent, Branched, EpisodeState, Plan, Reseeded, Session, Tape
 from ..errors import StoreError, describe_error
+from .lines import Lines
 from .recipes import FORMAT, Json, recipe_of
 from .values import digest_of, encode_value
 
 Put = Callable[[Json], object]
 """Gets a line of a file."""
-
-# ``JSONEncoder.encode`` makes it for each line, which takes twice the time.
-_chunks: Any = c_make_encoder(None, None, encode_basestring, None, ": ", ", ", False, False, True)
-
-
-def to_text(line: Json) -> str:
-    """Return a line of a file."""
-    return "".join(_chunks(line, 0))
 
 
 def decision_of(episode: EpisodeState, agent: Agent) -> Json:
@@ -83,8 +74,9 @@ class FileTape(Tape):
         episode = self._episode()
         if episode is None:
             return
-        if type(answer) is Reseeded:
-            self._pass_on({"reseed": answer.seed})
+        kind = type(answer)
+        if kind is Reseeded or kind is Branched:
+            self._pass_on({"reseed": answer.seed} if kind is Reseeded else {"branch": answer.agent})
             return
         line = decision_of(episode, episode.latest)
         if episode.latest.delegated:
@@ -147,9 +139,10 @@ class Recorder(FileTape):
         """Begin the file of a session's next episode."""
         seed = session.seed or 0
         self.path = folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{seed}-{uuid4().hex[:8]}.jsonl"
-        super().__init__(session, partial(_append, str(self.path)))
+        add = Lines(self.path).add
+        super().__init__(session, add)
         self._keeps: bool | None = session.plan.options.record_all  # None: its end is written
-        _append(str(self.path), head_of(recipe, view, seed, session.options))
+        add(head_of(recipe, view, seed, session.options))
 
     def end(self, error: BaseException | None = None) -> str:
         """Finish the file after an error, or if all are kept. Else remove it."""
@@ -167,12 +160,3 @@ class Recorder(FileTape):
             self._put = None
             self.path.unlink(missing_ok=True)
         return ""
-
-
-def _append(path: str, line: Json) -> None:
-    """Append a line to a file."""
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(file, f"{to_text(line)}\n".encode(errors="surrogatepass"))
-    finally:
-        os.close(file)

@@ -19,7 +19,7 @@ from multiprocessing.context import BaseContext
 from tempfile import mkstemp
 from threading import Event, Thread
 from time import monotonic
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -168,6 +168,35 @@ def _shared(bar: ProgressBar) -> Iterator[str]:
         os.remove(path)
 
 
+# -- what a run has before it ----------------------------------------------------------------------
+
+
+class Load(NamedTuple):
+    """The episodes of a run, and the processes that share them."""
+
+    episodes: int
+    processes: int
+
+
+_LOADS: Final[list[Load]] = []
+
+
+@contextmanager
+def _loaded(episodes: int, processes: int) -> Iterator[None]:
+    """Let the first planner of a run take its load."""
+    before = [*_LOADS]
+    _LOADS.append(Load(episodes, processes))
+    try:
+        yield
+    finally:
+        _LOADS[:] = before
+
+
+def take_load() -> Load | None:
+    """Return the load of the run, once. None outside of runs."""
+    return _LOADS.pop() if _LOADS else None
+
+
 # -- processes of joblib --------------------------------------------------------------------------
 
 
@@ -195,7 +224,8 @@ def spread(
         The result of each part, in the order of the items.
     """
     if not workers or not items:
-        return [work(*arguments, items, bar)]
+        with _loaded(len(items), 1):
+            return [work(*arguments, items, bar)]
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
     fewest = min(least, ceil(len(items) / processes))
@@ -209,7 +239,11 @@ def spread(
     call = joblib.delayed(pack_outcome)
     results: list[Result] = []
     with _shared(bar) as path:
-        outcomes = parallel(call(_work, parcel, os.getpid(), path, part) for part in parts)
+        load = Load(len(items), processes)
+        outcomes = parallel(
+            call(_work, parcel, os.getpid(), path, load if part is parts[0] else None, part)
+            for part in parts
+        )
         try:
             for _, outcome in zip(parts, outcomes, strict=True):
                 returned, error = unpack_outcome(outcome)
@@ -229,7 +263,7 @@ def spread(
 
 
 def _work(
-    parcel: bytes, home: int, path: str, items: Sequence[object]
+    parcel: bytes, home: int, path: str, load: Load | None, items: Sequence[object]
 ) -> tuple[object, dict[str, dict[str, float]], int]:
     """Work on a part of the items, in a worker. ``path`` is for its ``_SharedBar``.
 
@@ -242,7 +276,8 @@ def _work(
         COUNTS.clear()
     work, arguments = unpack(parcel)
     bar = _SharedBar(path) if path else NO_BAR
-    return work(*arguments, items, bar), COUNTS if is_away else {}, bar.missing
+    with nullcontext() if load is None else _loaded(*load):
+        return work(*arguments, items, bar), COUNTS if is_away else {}, bar.missing
 
 
 # -- processes of a pool --------------------------------------------------------------------------

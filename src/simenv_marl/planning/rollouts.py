@@ -21,6 +21,7 @@ from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation, is_deterministic
 from .candidates import Candidate, Choice, Course, First, Metric, Propose, Task, is_policy
+from .costs import say_costs
 from .player import Environment, Player, is_finite
 from .players import player_of
 from .rollout import Indices, Rollout, Try, try_out
@@ -488,6 +489,8 @@ class RolloutPolicy(Task):
             )
         taken = rollouts.rule
         if number > 1:
+            branches = budget if rollouts.reseeds else number
+            say_costs(player, self, number, branches, self.method, self.time_limit)
             taken = rollouts.settle(rollouts.search(budget))
         values = rollouts.values(taken)
         if choice is None or not rollouts.courses[taken].decisions:

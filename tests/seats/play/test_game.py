@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, aec_env, make_step, simulate
+from simenv_marl import RULE, aec_env, load_episode, make_step, save_episode, simulate
 from simenv_marl.data import joint_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
@@ -29,7 +29,7 @@ from simenv_marl.seats.play.game import Game
 from simenv_marl.seats.play.host import Host, Rules
 from simenv_marl.seats.play.recording import read
 from tests.planning.test_candidates import Works, points
-from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
+from tests.seats.play.worlds import ORDER, BreakingShop, ClosingShop, FixedShop, Shop
 from tests.worlds import models
 
 
@@ -376,7 +376,8 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_host, 
 def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
-    assert json.loads(path.read_text()) == {"simulation": "shop", "seed": 5, "seats": ["buyer"]}
+    head = json.loads(path.read_text())
+    assert (head["seed"], head["play"]) == (5, {"simulation": "shop", "seats": ["buyer"]})
     play(host, [2] * 8)
     host.abandon()
     host.game.restart(6)
@@ -753,3 +754,96 @@ def test_a_game_that_is_over_is_resumed_at_its_end(make_host, tmp_path):
     again.handle("buyer", {"do": "undo"})
     assert settle(again)["turn"] == 14
     assert settle(make_host(record=path))["turn"] == 14
+
+
+def places_of(env):
+    """Return where an environment stands: its model, and the pending decision."""
+    shop = env.unwrapped.simulation
+    state = shop.day, shop.stock, shop.profit, shop.switches, shop.random.getstate()
+    return state, [*env.agents], env.agents and repr(env.last())
+
+
+def test_a_recording_is_the_file_of_an_episode(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
+    host.game.restart(9)
+    play(host, [1, 3, 2])
+    host.handle("buyer", {"do": "undo"})
+    settle(host)
+    by_hand = aec_env(Shop)
+    by_hand.reset(seed=9)
+    for action in (1, np.array([0, 1]), 3, np.array([0, 1])):
+        by_hand.step(action)
+    assert places_of(load_episode(path)) == places_of(by_hand)
+    host.handle("buyer", {"do": "redo"})
+    by_hand.step(2)
+    by_hand.step(np.array([0, 1]))
+    assert places_of(load_episode(path)) == places_of(by_hand)
+    play(host, [0] * 5)
+    loaded = load_episode(path)
+    assert (loaded.agents, loaded.episode.terminated) == ([], True)
+    host.handle("buyer", {"do": "restart", "n": 3})
+    settle(host)
+    assert load_episode(path).session.seed == 3
+    host.handle("buyer", {"do": "redo"})
+    assert load_episode(path).session.seed == 9
+
+
+def test_a_recording_after_an_error_is_loaded_before_it(make_host, tmp_path):
+    host = make_host(BreakingShop, record=tmp_path / "game.jsonl")
+    assert "the till is broken" in play(host, [1, 3])["over"]
+    loaded = load_episode(tmp_path / "game.jsonl")
+    with pytest.raises(ZeroDivisionError, match="the till is broken"):
+        loaded.step(3)
+
+
+def test_the_ends_of_agents_are_in_the_recording(make_host, tmp_path):
+    host = make_host(ClosingShop, seats=(), record=tmp_path / "game.jsonl")
+    for _ in range(4):
+        settle(host)
+        host.abandon()
+        host.game.decide(0 if host.game.now["agent"] == "buyer" else [0, 1], "person")
+    loaded = load_episode(tmp_path / "game.jsonl")
+    assert loaded.agents == host.game.env.agents
+    assert repr(loaded.last()) == repr(host.game.env.last())
+
+
+OLD = [
+    (0, "buyer", 1, "person"),
+    (1, "seller", [0, 1], "person"),
+    (2, "buyer", 3, "person"),
+    (2, None, None, None),
+    (2, "buyer", None, "rule"),
+]
+
+
+def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
+    path = tmp_path / "game.jsonl"
+    before = make_host(seats=())
+    play(before, [1])
+    before.abandon()
+    before.game.decide([0, 1], "person")
+    lines = [{"simulation": "shop", "seed": 5, "seats": []}]
+    for turn, agent, action, by in OLD:
+        answer = {"action": action, "by": by, "words": "", "number": 1, "time": 0.0}
+        seen = before.game.timeline[turn]["seen"]
+        lines.append({"turn": turn} | (answer | {"agent": agent, "seen": seen} if agent else {}))
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    again = make_host(seats=(), record=path)
+    settle(again)
+    assert [(row["action"], row["by"]) for row in again.game.timeline[:3]] == [
+        (1, "person"), ([0, 1], "person"), (None, "rule"),
+    ]  # fmt: skip
+    play(again, [[1, 1]])
+    assert [len(each.decisions) for each in read(path)] == [4]
+    assert replay(path, Shop)["seller"].actions.tolist() == [[0, 1], [1, 1]]
+    with pytest.raises(OptionValueError, match="its max_steps is None, not 3"):
+        make_host(record=path, options={"max_steps": 3})
+
+
+def test_other_files_of_episodes_are_no_recordings(make_host, tmp_path):
+    env = aec_env(Shop)
+    env.reset(seed=1)
+    save_episode(env, tmp_path / "episode")
+    with pytest.raises(OptionValueError, match="no recording of a game"):
+        make_host(record=tmp_path / "episode")

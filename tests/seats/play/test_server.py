@@ -15,8 +15,10 @@ from unittest.mock import AsyncMock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+import numpy as np
 import pytest
 
+from simenv_marl import parallel_env, save_episode
 from simenv_marl.__main__ import main
 from tests.processes import ROOT, gone
 
@@ -39,13 +41,13 @@ SHOP = "tests.seats.play.worlds:Shop"
 class Server:
     """The command, and the links that it prints."""
 
-    def __init__(self, *arguments, simulation=SHOP):
+    def __init__(self, *arguments, simulation=SHOP, command="play"):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
         command = [
             sys.executable,
             "-m",
             "simenv_marl",
-            "play",
+            command,
             simulation,
             *(() if "--port" in arguments else ("--port", "0")),
             *arguments,
@@ -377,6 +379,26 @@ def test_a_resumed_game_has_the_same_links(tmp_path):
     assert server.page("buyer").wait("state")["history"][0]["action"] == 2
     assert server.end()[0] == 0
     assert (tmp_path / "game.jsonl.keys").stat().st_mode & 0o077 == 0
+
+
+def test_a_file_of_an_episode_is_opened_at_a_decision(tmp_path):
+    env = parallel_env(Shop)
+    env.reset(seed=5)
+    for amount in (2, 1, 0):
+        env.step({"buyer": amount, "seller": np.array([0, 1])})
+    save_episode(env, tmp_path / "saved")
+    for until, actions in ((None, [2, 1, 0]), (2, [2, 1])):
+        options = () if until is None else ("--until", str(until))
+        server = Server("--play", *options, simulation=str(tmp_path / "saved"), command="replay")
+        buyer = server.page("buyer")
+        state = buyer.wait_for_turn(2 * len(actions))
+        assert [row["action"] for row in state["history"][::2]] == actions
+        buyer.send(do="act", turn=2 * len(actions), action=1)
+        assert buyer.wait_for_turn(2 * len(actions) + 1)["history"][-1]["by"] == "person"
+        buyer.socket.close()
+        assert server.end()[0] == 0
+    (tmp_path / "saved").write_text("{}")
+    assert main(["replay", str(tmp_path / "saved"), "--play", "--port", "0"]) == 2
 
 
 def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):

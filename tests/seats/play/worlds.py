@@ -151,3 +151,15 @@ class BreakingShop(Shop):
             if self.order() == 3:
                 raise ZeroDivisionError("the till is broken")
             self.day += 1
+
+
+class ClosingShop(Shop):
+    """Its seller leaves after two days."""
+
+    days = 2
+
+    def run(self):
+        super().run()
+        self.end_agent("seller")
+        for self.day in range(3, 6):
+            self.order()

@@ -31,6 +31,7 @@ from ..switching.context import ExclusiveLock, environment_context
 from ..switching.generators import is_seed
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
+from ..values.clock import Clock
 from ..values.common import Encode, common_observations
 from ..values.spaces import observation_cast
 from ..values.stacking import stacked, stacker
@@ -49,12 +50,14 @@ class Snapshot(NamedTuple):
         seed: The seed of the latest episode.
         np_random_seed: The seed of the generator.
         np_random: The generator.
+        kind: The view.
     """
 
     state: State
     seed: int | None
     np_random_seed: int | None
     np_random: np.random.Generator | None
+    kind: str
 
 
 class PendingDecision(NamedTuple):
@@ -94,6 +97,13 @@ class Reseeded:
     seed: int
 
 
+@dataclass(frozen=True)
+class Branched:
+    """On a tape: here a planner's branch begins, which waits for one agent alone."""
+
+    agent: str
+
+
 class Tape(list[Action]):
     """The answers of the user and of policies. A file of an episode has a tape that writes them."""
 
@@ -120,6 +130,9 @@ class EpisodeOwner(Protocol):
     def new_tape(self) -> Tape:
         """Return the tape for another episode."""
 
+    def new_clock(self) -> Clock | None:
+        """Return the clock for another episode. None if the simulation has no time."""
+
     def read_state(self) -> Model:
         """Return the state of the simulation."""
 
@@ -133,6 +146,7 @@ class BaseSession(ABC):
         where: Whether it belongs to the user, a clone or a branch.
         seed: The seed of the latest episode.
         options: The options of the latest reset.
+        kind: The view that its user has. Empty without one, and in vector environments.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
         exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
         lock: The same lock, if steps need it, too. None if only the thread that began an episode
@@ -144,6 +158,7 @@ class BaseSession(ABC):
     _state: State = State.NEW
     seed: int | None = None
     options: ResetOptions = None
+    kind: str = ""
     np_random_seed: int | None = None
     _np_random: np.random.Generator | None = None
     exclusive: ExclusiveLock = field(default_factory=ExclusiveLock)
@@ -173,11 +188,11 @@ class BaseSession(ABC):
         """Return the record for a copy."""
         has_decision = self.episode is not None and self.episode.pending is not None
         state = State.COPIED if has_decision else State.NEW
-        return Snapshot(state, self.seed, self.np_random_seed, self._np_random)
+        return Snapshot(state, self.seed, self.np_random_seed, self._np_random, self.kind)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Take over the record of another session."""
-        self._state, self.seed, self.np_random_seed, self._np_random = snapshot
+        self._state, self.seed, self.np_random_seed, self._np_random, self.kind = snapshot
 
     def refusal(self) -> SimEnvError:
         """Make the error that says why no action can be taken now."""

@@ -49,10 +49,9 @@ from ..plans.policies import (
 )
 from ..switching.driver import WAIT, Driver, Event
 from ..values.actions import ILLEGAL
-from ..values.clock import Clock
 from ..values.spaces import duplicate
 from .agent import Agent, DecisionHandler
-from .base import GO_ON, LONGEST_TAPE, EpisodeOwner, Replay, Tape
+from .base import GO_ON, LONGEST_TAPE, Branched, EpisodeOwner, Replay, Tape
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
 from .steps import Round, Team
@@ -88,7 +87,6 @@ class Episode(EpisodeState):
         self,
         session: EpisodeOwner,
         simulation: Model,
-        clock: Clock | None,
         driver: Driver,
         seed: int,
         replay: Replay | None,
@@ -97,7 +95,7 @@ class Episode(EpisodeState):
     ) -> None:
         """Prepare the run of a simulation that has been reset. The next ``resume`` begins it."""
         plan = session.plan
-        super().__init__(plan, seed, clock, session.where, in_rounds=in_rounds)
+        super().__init__(plan, seed, session.new_clock(), session.where, in_rounds=in_rounds)
         self.session: Callable[[], EpisodeOwner | None] = ref(session)
         self.simulation = simulation
         self.driver = driver
@@ -363,7 +361,7 @@ class Episode(EpisodeState):
         if self.replay and self.replay[0] is GO_ON:
             self.replay = None
         if self.replay is not None:
-            if not self.replay:  # the other episode stands here
+            if not self.replay or isinstance(self.replay[0], Branched):  # the other one stands here
                 self.consulted = self.pending = agent
                 return WAIT
             action = self.replay.popleft()
@@ -561,8 +559,7 @@ class Episode(EpisodeState):
         """In a branch, wait for one agent alone. Policies answer for the others, else the rule."""
         self.plan = self.plan.for_one(agent.name)
         self.move_to(Where.BRANCH)
-        self.tape = Tape()  # it cannot be replayed, because this is not on the tape
-        self._tape_size = 0
+        self.record(Branched(agent.name))
         for name, other in self.agents.items():
             if other is not agent:
                 self._most_steps = maxsize  # ``max_steps`` counts the steps of other agents
@@ -590,6 +587,8 @@ class Episode(EpisodeState):
             name: two_arguments(policy_for(policies, name, self.where)) for name in names
         }
         self.plan = self.plan.with_policies(substitutes)
+        self.tape = Tape()  # it cannot be replayed, because these are not on the tape
+        self._tape_size = 0
         for name, agent in self.others.items():
             substitute = substitutes.get(name, substitutes.get(EVERYONE, RULE))
             if agent.policy is RULE and substitute is not RULE:

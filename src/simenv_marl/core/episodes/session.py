@@ -25,7 +25,7 @@ from ...errors import (
 )
 from ...hooks.handlers import Installation
 from ...hooks.places import homes_of, is_outdated
-from ...simulation import Model, make_simulation, optional_method, passing, takes
+from ...simulation import Action, Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -34,8 +34,10 @@ from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.clock import Clock
 from ..values.spaces import same
 from .base import (
+    GO_ON,
     LONGEST_TAPE,
     BaseSession,
+    Branched,
     PendingDecision,
     Recording,
     Replay,
@@ -61,21 +63,28 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_defined", "_driver", "_homes", "_installed", "_make_tape", "_replay",
-        "_reset", "_rng", "_simulation", "context", "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_defined", "_driver", "_homes", "_in_rounds", "_installed",
+        "_make_tape", "_replay", "_reset", "_rng", "_simulation", "context", "episode", "handlers",
+        "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
     handlers: Handlers
     _driver: Driver
 
-    def __init__(self, plan: Plan, unmatched_names: UnmatchedNames | None = None) -> None:
+    def __init__(
+        self, plan: Plan, unmatched_names: UnmatchedNames | None = None, *, kind: str = ""
+    ) -> None:
         """Make the simulation, and set the plan's decision functions in the model.
 
-        ``unmatched_names``: shared by sessions that run side by side.
+        Args:
+            plan: The plan.
+            unmatched_names: Is shared by sessions that run side by side.
+            kind: The view.
         """
-        super().__init__(plan, Where.USER)
+        super().__init__(plan, Where.USER, kind=kind)
         self.episode = None
+        self._in_rounds = False  # at the beginning of the episode
         self._make_tape: Callable[[Session], Tape] | None = None
         self._replay: Replay | None = None
         self.unmatched_names = unmatched_names or UnmatchedNames(plan.named_agents)
@@ -171,6 +180,7 @@ class Session(BaseSession):
                     self._installed = Installation(self.plan.patches)
                 self._warn_of_outdated()
                 self.options = options
+                self._in_rounds = in_rounds
                 self.seed = self.seed_for(seed)
                 if replay is None:
                     replay, self._replay = self._replay, None
@@ -263,20 +273,23 @@ class Session(BaseSession):
         simulation = self._simulation
         self._reset(seed=seed, options=self.options)
         self._close = self._closer
-        clock = self._make_clock()  # anew, because a reset may set another one
-        if clock is None and self.plan.options.discount_rate is not None:
-            raise OptionValueError(
-                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
-                " method time(); add one that returns its clock, or leave out discount_rate"
-            )
         self.episode = episode = Episode(
-            self, simulation, clock, self._driver, seed, replay, in_rounds=in_rounds
+            self, simulation, self._driver, seed, replay, in_rounds=in_rounds
         )
         return simulation.run, self.handlers.with_agents(episode.agents.values())
 
-    def _make_clock(self) -> Clock | None:
-        """Make the clock of the simulation. None if it has no time."""
+    def new_clock(self) -> Clock | None:
+        """Return the clock for another episode. None if the simulation has no time.
+
+        It is another one for each episode, because a reset may set another method.
+        """
         time = optional_method(self._simulation, "time")
+        if time is None and self.plan.options.discount_rate is not None:
+            raise OptionValueError(
+                "discount_rate needs the times of decisions, but"
+                f" {short_repr(self._simulation)} has no method time(); add one that returns its"
+                " clock, or leave out discount_rate"
+            )
         if time is None:
             return None
         if self.plan.plugins is not None or self._rng is not None:
@@ -388,14 +401,13 @@ class Session(BaseSession):
             raise self.refusal()
         if not episode.is_recorded:
             raise BranchError(
-                f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of"
-                " the environment that a policy is given, so its actions were not kept; use"
-                ' method="fork"'
+                f"the episode has more than {LONGEST_TAPE:,} decisions, or is a branch in which a"
+                ' base decides for others, so its actions were not kept; use method="fork"'
             )
         return Recording(
             episode.seed,
             self.options,
-            episode.in_rounds,
+            self._in_rounds,
             [*episode.tape],
             _pending_decision(episode),
         )
@@ -413,11 +425,7 @@ class Session(BaseSession):
             recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
         )
         while replay:
-            answer = replay.popleft()
-            if isinstance(answer, Reseeded):
-                self.reseed(answer.seed)
-            else:
-                episode.step(answer)
+            self.repeat(replay, episode.step)
         episode.end_replay()
         if original.episode is not None:
             episode.remember(original.episode)
@@ -430,6 +438,20 @@ class Session(BaseSession):
             )
         state = self._state
         self.restore(copy.deepcopy(original.snapshot())._replace(state=state))
+
+    def repeat(self, replay: Replay, step: Callable[[Action], object]) -> None:
+        """Repeat the user's answers by ``step``, up to the beginning of a branch, or to the end."""
+        while replay and replay[0] is not GO_ON:
+            answer = replay.popleft()
+            if isinstance(answer, Reseeded):
+                self.reseed(answer.seed)
+            elif isinstance(answer, Branched) and self.episode is not None:
+                if self.episode.deciding is None:
+                    raise self.episode.refusal()
+                self.episode.single_out(self.episode.deciding)
+                return
+            else:
+                step(answer)
 
     # -- branches ---------------------------------------------------------------------------------
 

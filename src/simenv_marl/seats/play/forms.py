@@ -90,6 +90,7 @@ def pending_decision(decision: Decision) -> Message:
         "displayed": decision.display is not None,
         "form": form_of(decision.action_space, decision.mask, decision.action_labels),
         "seen": digest_of(decision.observation),
+        "mask": None if decision.mask is None else digest_of(decision.mask),
     }
 
 

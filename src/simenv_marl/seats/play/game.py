@@ -16,17 +16,21 @@ from ...errors import (
     did_you_mean,
 )
 from ...files.lines import Lines
+from ...files.reader import EpisodeLines, follow
+from ...files.recipes import Json, recipe_of
+from ...files.tapes import head_of
+from ...files.values import encode_value
 from ...simulation import Action, Model
-from ..descriptions import JSON, at_decision
+from ..descriptions import at_decision
 from .deciders import Deciders
 from .forms import Message, action_of, jsonable, pending_decision, words_of
-from .recording import Episode, follow, read
+from .recording import answer_in, read
 
 CHECKPOINTS: Final = 24
 """The largest number of checkpoints. Each one is a process."""
 
-RECORDED: Final = ("turn", "agent", "number", "action", "words", "by", "seen", "time")
-"""The keys of a decision in a recording."""
+NOTED: Final = ("turn", "number", "words", "by", "time")
+"""The keys of a decision that a recording has besides those of every file of an episode."""
 
 REPEATED: Final = ("agent", "before", "seen", "time")
 """The keys of a decision that are the same when it is reached again."""
@@ -63,6 +67,7 @@ class Game:
         options: The options of ``aec_env``.
         record: The file of the recording. The last episode in it goes on.
         new: Whether to begin another episode instead.
+        reset: The options of resets.
         can_fork: Whether checkpoints can be made. Else the way back is a replay.
         checkpoints: The checkpoints, by turn.
         episodes: The episodes, as the recording has them. The last one is played.
@@ -88,6 +93,7 @@ class Game:
     options: EpisodeOptions = field(default_factory=EpisodeOptions)
     record: Path | None = None
     new: bool = False
+    reset: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         """Begin an episode, or go on with the recorded one.
@@ -104,13 +110,17 @@ class Game:
         self.turn = 0
         self.moment = 0
         self.returns: dict[str, float] = {}
-        self._unsaved: list[JSON] = []  # the lines that could not be written yet
-        self.episodes: list[Episode] = []
+        self._unsaved: list[Json] = []  # the lines that could not be written yet
+        self.episodes: list[EpisodeLines] = []
         if self.record is not None and self.record.exists() and not self.new:
             self.episodes = read(self.record)
         self.resumed = bool(self.episodes)
+        if self.resumed and "play" not in self.episodes[-1].head:
+            raise OptionValueError(
+                f"{self.record} is no recording of a game: go on from there by `replay --play`"
+            )
         if self.resumed and not self.seats:
-            self.seats = self.episodes[-1].header.get("seats", ())
+            self.seats = self.episodes[-1].head["play"].get("seats", ())
         roster = self.root.session.plan.roster
         agents: list[str] = getattr(self.root, "possible_agents", [])
         for seat in set(self.seats).difference(agents or self.seats):
@@ -164,27 +174,28 @@ class Game:
 
     def restart(self, seed: int) -> None:
         """Begin another episode. ``go_back`` returns to the present one."""
-        self._begin(seed)
-        self._record(self._header())
+        exits = self._begin(seed)
+        self._record(self._head(), *exits)
 
     def go_back(self) -> None:
         """Return to the episode before the latest restart."""
         self._record({"back": True})
         self._load()
 
-    def _header(self) -> Message:
-        header: Message = {"simulation": self.name, "seed": self.seed, "seats": list(self.seats)}
-        for name, value in self.options.items():
-            if name in ("skip_forced", "max_steps"):
-                header[name] = value
-        return header
+    def _head(self) -> Json:
+        """Return the first line of the episode."""
+        recipe: Json = {}
+        if self.record is not None:  # whoever loads the file gives again what has no name
+            recipe = recipe_of(self.root.session.plan, unnamed=True)
+        game = {"simulation": self.name, "seats": list(self.seats)}
+        return head_of(recipe, self.root.kind, self.seed, self.reset) | {"play": game}
 
-    def _begin(self, seed: int) -> None:
+    def _begin(self, seed: int) -> list[Json]:
         self.forget(-1)
         self.seed = seed
         self.notice = ""
         self.timeline = []
-        self._return_to(0)
+        return self._return_to(0)
 
     def _resume(self) -> None:
         """Go on with the last recorded episode.
@@ -194,13 +205,13 @@ class Game:
         """
         problem = f"the recording {self.record} cannot be resumed"
         remedy = "begin another game by --new, or use another file"
-        header = self._header()
-        for key in ("simulation", "skip_forced", "max_steps"):
-            recorded, present = self.episodes[-1].header.get(key), header.get(key)
-            if str(recorded).replace(":", ".") != str(present).replace(":", "."):
-                raise OptionValueError(
-                    f"{problem}: its {key} is {recorded}, not {present}; {remedy}"
-                )
+        recorded, head = self.episodes[-1].head, self._head()
+        pairs = {"simulation": (each["play"].get("simulation") for each in (recorded, head))}
+        for key in ("skip_forced", "max_steps"):
+            pairs[key] = (each["options"].get(key) for each in (recorded, head))
+        for key, (before, now) in pairs.items():
+            if str(before).replace(":", ".") != str(now).replace(":", "."):
+                raise OptionValueError(f"{problem}: its {key} is {before}, not {now}; {remedy}")
         try:
             self._load()
         except InvalidActionError as error:
@@ -213,26 +224,27 @@ class Game:
             InvalidActionError: The simulation does not repeat it.
         """
         episode = self.episodes[-1]
-        self._begin(episode.header["seed"])
+        self._begin(episode.head["seed"])
         for line in episode.decisions:
             row = self.now
             if row is None or any(row[key] != line[key] for key in ("agent", "seen")):
                 raise InvalidActionError(
                     f"the simulation does not repeat decision {line['turn']} of {line['agent']}"
                 )
-            self._take(line["action"], line["by"])
+            self._take(answer_in(line), line["by"])
         if episode.turn != self.turn:
             self._go_to(episode.turn)
 
-    def _record(self, line: Message) -> None:
-        """Add a line to the episodes and their file, with those that could not be written before.
+    def _record(self, *lines: Json) -> None:
+        """Add lines to the episodes and their file, with those that could not be written before.
 
         The file is closed in between: clones need not copy it.
         """
-        follow(self.episodes, line)
+        for line in lines:
+            follow(self.episodes, 0, line)
         if self.record is None:
             return
-        self._unsaved.append(jsonable(line))
+        self._unsaved += lines
         try:
             Lines(self.record).append(*self._unsaved)
             self._unsaved.clear()
@@ -251,16 +263,21 @@ class Game:
         Raises:
             InvalidActionError: The action is not legal. The decision stays pending.
         """
-        row = self._take(action, by)
-        line = {key: value for key, value in row.items() if key in RECORDED}
+        space = self.env.action_space(self.timeline[self.turn]["agent"])
+        row, exits = self._take(action, by)
+        line = {key: row[key] for key in ("agent", "seen", "mask") if row[key] is not None}
+        line["action"] = encode_value(action_of(space, action))
+        line["play"] = {key: row[key] for key in NOTED}
+        lines = [line, *exits]
         if self.over:
-            line |= {"end": self.over, "returns": self.returns}
+            key = "end" if self.over in ("terminated", "truncated") else "error"
+            lines.append({key: self.over, "play": {"returns": {**self.returns}}})
             absent = [seat for seat in self.seats if seat not in self.latest]
             if absent:
                 names = ", ".join(absent)
                 others = ", ".join(self.latest)
                 self.notice = f"No decision was one of {names}; {others} decided."
-        self._record(line)
+        self._record(*lines)
 
     def answer(self) -> None:
         """Take the pending decision by the policy of its agent, or else by the rule."""
@@ -274,15 +291,15 @@ class Game:
         except Exception as error:
             self._fail(f"the policy of {agent} has failed: {describe_error(error)}")
 
-    def _take(self, action: Action, by: str) -> Row:
+    def _take(self, action: Action, by: str) -> tuple[Row, list[Json]]:
+        """Take the pending decision. Return its row, and the lines of ended agents."""
         row = self.timeline[self.turn]
         self._step(row["agent"], action)
         self.forget(self.turn)
         del self.timeline[self.turn + 1 :]
         words = "" if action is None else words_of(row["form"], action)
         row |= {"action": action, "by": by, "words": words, "reward": None}
-        self._arrive(self.turn + 1)
-        return row
+        return row, self._arrive(self.turn + 1)
 
     def _step(self, agent: str, action: Action) -> None:
         self._attempt(self.env.step, action_of(self.env.action_space(agent), action))
@@ -345,7 +362,7 @@ class Game:
             for turn in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]:
                 self.checkpoints.pop(turn).env.close()
 
-    def _return_to(self, turn: int) -> None:
+    def _return_to(self, turn: int) -> list[Json]:
         """Continue at a checkpoint. The beginning needs none."""
         previous = self.env
         self.over = ""
@@ -357,15 +374,16 @@ class Game:
         else:
             self.env = self.root
             self.returns = {}
-            self._attempt(self.root.reset, self.seed)
+            self._attempt(self.root.reset, self.seed, self.reset)
         if previous is not self.root:
             previous.close()
-        self._arrive(turn)
+        return self._arrive(turn)
 
     # -- arrivals ---------------------------------------------------------------------------------
 
-    def _arrive(self, turn: int) -> None:
-        """Note the reward of the agent that decides next, and the agents that have ended."""
+    def _arrive(self, turn: int) -> list[Json]:
+        """Note the reward of the agent that decides next. Return the lines of ended agents."""
+        exits: list[Json] = []
         self.turn = turn
         self.moment += 1
         end = "terminated"
@@ -375,10 +393,12 @@ class Game:
             self._add_reward(agent, reward, info)
             if not (terminated or truncated):
                 self._note_pending(agent)
-                return
+                return exits
             end = "truncated" if truncated else "terminated"
             self.env.step(None)
+            exits.append({"exit": agent})
         self.over = self.over or end
+        return exits
 
     def _add_reward(
         self,

@@ -1,85 +1,42 @@
 """Recordings of the page, and the episodes that they describe."""
 
 import os
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
 
 from ...core import Decision, EpisodeOptions, Points
 from ...data import Trajectories, collect_episodes
 from ...errors import (
+    EpisodeFileError,
     InvalidActionError,
     OptionValueError,
     StoreError,
     UnknownPointError,
     short_repr,
 )
-from ...files.lines import Lines
-from ...files.values import digest_of
-from ...simulation import Action, Model, Observation
-from .forms import Message, action_of
+from ...files.reader import EpisodeLines, read_episodes
+from ...files.recipes import Json
+from ...files.values import decode_value, digest_of
+from ...simulation import RULE, Action, Model, Observation
+from .forms import action_of, jsonable
 
 
-@dataclass
-class Episode:
-    """A recorded episode.
-
-    Attributes:
-        header: Its first line, with the simulation, the seed, the seats and the options.
-        decisions: The lines of its decisions, without those that later ones have replaced.
-        turn: Where the game stands: the number of decisions before the pending one.
-    """
-
-    header: Message
-    decisions: list[Message] = field(default_factory=list)
-    turn: int = 0
-
-    def add(self, line: Message) -> None:
-        """Add a line: a decision, or a move to another turn.
-
-        Raises:
-            ValueError: The line before it is missing.
-        """
-        if not 0 <= line["turn"] <= len(self.decisions):
-            raise ValueError(f"the decision before turn {line['turn']} is missing")
-        self.turn = line["turn"]
-        if "agent" in line:
-            self.decisions[self.turn :] = [line]
-            self.turn += 1
-
-
-def follow(episodes: list[Episode], line: Message) -> None:
-    """Add a line to the episodes that the lines before it describe.
-
-    Raises:
-        ValueError, LookupError: The line does not fit the lines before it.
-    """
-    if "seed" in line:
-        episodes.append(Episode(line))
-    elif line.get("back"):
-        episodes.pop()  # the game before the restart goes on
-    else:
-        episodes[-1].add(line)
-
-
-def read(path: str | os.PathLike[str]) -> list[Episode]:
+def read(path: str | os.PathLike[str]) -> list[EpisodeLines]:
     """Read the episodes of a recording.
-
-    A decision replaces the earlier ones from its turn on, which were undone. A line that a crash
-    has torn is left out.
 
     Raises:
         StoreError: The file cannot be read, or the lines do not fit together.
     """
-    episodes: list[Episode] = []
     try:
-        for _, line in Lines(path).read():
-            follow(episodes, line)
-        if not episodes and Path(path).stat().st_size:
-            raise ValueError("it has no episode")
-    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise StoreError(f"the recording {path} cannot be read: {error!r}") from error
-    return episodes
+        return read_episodes(path) if Path(path).stat().st_size else []
+    except (OSError, EpisodeFileError) as error:
+        raise StoreError(f"the recording {path} cannot be read: {error}") from error
+
+
+def answer_in(line: Json) -> Action:
+    """Return the action of a line as JSON for the page; None for the rule."""
+    action = decode_value(line["action"])
+    return None if action is RULE else jsonable(action)
 
 
 def replay(
@@ -114,7 +71,7 @@ def replay(
         raise OptionValueError(
             f"nothing was decided in episode {episode} of the {len(episodes)} of {path}"
         )
-    header = episodes[episode].header
+    head = episodes[episode].head
     decisions = episodes[episode].decisions
     lines = iter(decisions)
     problem = f"{short_repr(simulation)} does not repeat {path}"
@@ -127,16 +84,16 @@ def replay(
                 f"{problem}: decision {line['turn']} was one of {line['agent']!r}, and is now one"
                 f" of {agent!r}, or with another observation"
             )
-        return action_of(_decision.action_space, line["action"])
+        return action_of(_decision.action_space, answer_in(line))
 
-    if header.get("skip_forced"):
+    if head["options"].get("skip_forced"):
         options.setdefault("skip_forced", True)
     options["max_steps"] = len(decisions)
     try:
         trajectories = collect_episodes(
             simulation,
             {line["agent"]: answer for line in decisions},
-            seeds=[header["seed"]],
+            seeds=[head["seed"]],
             points=points,
             **options,
         )

@@ -1,17 +1,27 @@
 """The function ``play``, which needs the server only when it is called."""
 
 import secrets
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Final, Unpack
 
 from ...core import EpisodeOptions, Points, Policy, Source, source_name
-from ...errors import OptionValueError
+from ...episodes import EpisodeFile
+from ...errors import EpisodeFileError, InvalidActionError, OptionValueError
+from ...files.recipes import Json
+from ...files.tapes import end_of
 from ...many.parallel import import_extra
+from ...simulation import RULE, Action
+from .forms import jsonable
 from .game import Game
 from .host import Rules
+
+OF_ONE_LEARNER: Final = ("agent", "flatten", "state_in_info")
+"""Options that the environment of a game does not take."""
 
 
 def play(
@@ -119,6 +129,93 @@ def find_game(
         else:
             raise OptionValueError(f"{text} is no dict of policies; write AGENT={text}")
     return make_game(find(simulation), found, **arguments)
+
+
+def open_game(path: Path, until: int | None, rules: Rules) -> tuple[Game, Rules]:
+    """Make a game that goes on from the file of an episode, of any view.
+
+    Args:
+        path: The file.
+        until: The number of decisions to repeat, as ``replay_episode`` takes it.
+        rules: The rules.
+
+    Raises:
+        EpisodeFileError: The file cannot be loaded, or no game can go on from there.
+        StoreError: It cannot be read.
+    """
+    file = EpisodeFile(path, until)
+    if file.is_branch:
+        raise EpisodeFileError(f"no game can go on from {path}: it is the branch of a planner")
+    view = file.load()  # verifies it in its own view
+    pending = end_of(view.episode)
+    simulation, points, options = file.arguments()
+    policies = options.pop("policies", {})
+    if view.kind != "aec" or policies:  # it counts other steps than a game does
+        limit = options.pop("max_steps", None)
+        pending = {} if limit is not None and "end" in pending else pending
+    name = view.session.plan.name
+    seats = file.head.get("play", {}).get("seats", [])
+    if view.kind == "single":
+        seats = [view.own_agent.name]
+    view.close()
+    for option in OF_ONE_LEARNER:
+        options.pop(option, None)
+    settings: Any = {"points": points, "policies": policies, "options": options}
+    game = Game(simulation, name, seats, file.head["seed"], **settings, reset=file.head["reset"])
+    try:
+        repeat(game, file, pending)
+    except InvalidActionError as error:
+        game.close()
+        raise EpisodeFileError(f"no game can go on from {path}: {error}") from error
+    return game, replace(rules, title=rules.title or name)
+
+
+def repeat(game: Game, file: EpisodeFile, pending: Json) -> None:
+    """Take the decisions of a file in a game, where rules take those that the file leaves to them.
+
+    ``pending``: the line of the decision, or of the end, to which they lead. Empty: a limit that
+    the game does not have.
+
+    Raises:
+        InvalidActionError: They do not lead there.
+    """
+    decisions: deque[tuple[Json, Action]] = deque()
+    deciders = {pending.get("agent")}
+    for _, line, answer in file.answers:
+        if "reseed" in line:
+            raise InvalidActionError("its chance was drawn anew in a clone")
+        if "agent" in line:
+            decisions.append((line, answer))
+            deciders.update(answer if isinstance(line["seen"], dict) else [line["agent"]])
+    actions: dict[str, Action] = {}  # of a round, that no decision has used
+    while game.now is not None:
+        agent = game.now["agent"]
+        by = "person" if agent in deciders else "rule"
+        if agent in actions:
+            answer = actions.pop(agent)
+        elif agent in deciders and not decisions:
+            break
+        elif agent in deciders:
+            line, answer = decisions.popleft()
+            if agent != line["agent"]:
+                raise InvalidActionError(f"{agent} decides in place of {line['agent']}")
+            if isinstance(line["seen"], dict):
+                actions = {**answer}
+                continue
+            by = line.get("by", by)
+        elif decisions or pending:
+            answer = RULE
+        else:
+            break
+        try:
+            game.decide(None if answer is RULE else jsonable(answer), by)
+        except InvalidActionError:
+            if not actions and not isinstance(pending.get("seen"), dict):
+                raise
+            actions = {}  # it was given before its decision has arisen, and is not legal by now
+    decider = None if game.now is None else game.now["agent"]
+    if pending and decider != pending.get("agent"):
+        raise InvalidActionError(f"{decider} decides in place of {pending.get('agent')}")
 
 
 def start(make: Any, **options: Any) -> str:

@@ -1,0 +1,118 @@
+"""Before a long run, a planner says what its decisions cost; bars show the remaining time."""
+
+import re
+import time
+
+import pytest
+
+from simenv_marl import evaluate, reseed_generators, simulate, simulate_many
+from simenv_marl.data import collect_episodes
+from simenv_marl.experiments import run_experiment
+from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, costs
+from tests.worlds.saved import Pumps
+
+SAID = re.compile(
+    r"simenv_marl: (\d+) candidates x (\d+) futures x ([\d.]+ m?s) on \d+ cores: about"
+    r" ([\d.]+ m?s) a decision, ([\d.]+ m?s) an episode"
+)
+
+
+class Slow(Pumps):
+    """Pumps that take a millisecond, whose future is one."""
+
+    deterministic = True
+
+    def pull(self):
+        time.sleep(0.001)
+        return super().pull()
+
+
+class Chance(Slow):
+    """Pumps whose future can be drawn anew."""
+
+    deterministic = False
+
+    def reseed(self, seed):
+        reseed_generators(self, seed)
+
+
+PLANNER = RolloutPolicy([[0, 1], [1, 0]], futures=2, horizon=3, every=4)
+POLICIES = {"push": PLANNER}
+NAMED = {"planner": POLICIES}
+
+RUNS = {
+    "evaluate": lambda store, **options: evaluate(Slow, NAMED, seeds=range(3), **options),
+    "stored": lambda store, **options: evaluate(
+        Slow, NAMED, seeds=range(3), store=store, **options
+    ),
+    "experiment": lambda store, **options: run_experiment(
+        Slow, [{}], contenders=NAMED, seeds=range(3), store=store, **options
+    ),
+    "many": lambda store, **options: simulate_many(Slow, POLICIES, seeds=range(3), **options),
+    "collected": lambda store, **options: collect_episodes(
+        Slow, POLICIES, seeds=range(3), **options
+    ),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_long_run_says_once_what_a_decision_costs(run, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(costs, "LONG", 0.01)
+    RUNS[run](tmp_path)
+    said = SAID.findall(capfd.readouterr().err)
+    assert len(said) == 1
+    assert said[0][:2] == ("3", "1")  # with the rule; and one future, because there is no other
+
+
+class VerySlow(Slow):
+    """Pumps of a run that takes longer than a minute."""
+
+    def pull(self):
+        time.sleep(0.02)
+        return super().pull()
+
+
+def stop(simulation):
+    """End the run after its first episode."""
+    raise TimeoutError
+
+
+def test_a_long_run_in_workers_says_it_once(capfd):
+    planner = RolloutPolicy([[0, 1], [1, 0]], futures=1, budget=5, every=12)
+    with pytest.raises(TimeoutError):
+        simulate_many(
+            VerySlow, {"push": planner}, seeds=range(200), workers=2, batch_size=1, collect=stop
+        )
+    assert len(re.findall("an episode", capfd.readouterr().err)) == 1
+
+
+@pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
+def test_all_planners_say_it(kind, monkeypatch, capfd):
+    monkeypatch.setattr(costs, "LONG", 0.01)
+    planner = kind([[0, 1], [1, 0]], futures=4, horizon=2, every=6)
+    simulate_many(Chance, {"push": planner}, seeds=[1, 2])
+    [(candidates, futures, *_)] = SAID.findall(capfd.readouterr().err)
+    assert (candidates, futures) == ("3", "4")
+
+
+def test_a_short_run_and_a_single_simulation_say_nothing(monkeypatch, capfd):
+    simulate_many(Slow, POLICIES, seeds=[1])
+    monkeypatch.setattr(costs, "LONG", 0.0)
+    simulate(Slow, POLICIES, seed=1)
+    assert capfd.readouterr().err == ""
+
+
+def test_what_a_decision_costs_does_not_change_it(monkeypatch, capfd):
+    before = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]
+    monkeypatch.setattr(costs, "LONG", 0.0)
+    after = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]
+    assert before == after
+    assert SAID.search(capfd.readouterr().err)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_bars_show_the_remaining_time(run, tmp_path, capfd):
+    RUNS[run](tmp_path, progress=True)
+    bars = re.findall(r"(\d+)/\d+ \[\d+:\d+<(\d+:\d+|\?)", capfd.readouterr().err)
+    assert bars[-1][1] != "?"
+    assert any(left != "?" for done, left in bars if 0 < int(done) < int(bars[-1][0]))

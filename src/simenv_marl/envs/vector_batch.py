@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import create_empty_array
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from ..core import (
@@ -43,7 +43,10 @@ class SimulationBatch:
     Attributes:
         views: The Gymnasium environments of the sub-environments.
         failed: Whether an error has left them at different steps, so that all of them need a reset.
+        restarts: 0, as there are no workers.
     """
+
+    restarts = 0
 
     def __init__(
         self,
@@ -73,6 +76,7 @@ class SimulationBatch:
                 self.abandon()
                 raise
         self._view = view
+        self._space = space
         self.views = [view.of_session(session) for session in self._sessions]
         self._stack = stacker(space, cast=True)
         self._stacked = create_empty_array(space, len(part))
@@ -163,6 +167,37 @@ class SimulationBatch:
             truncations,
             infos,
         )
+
+    def take_over(self, observations: Observation, seeds: list[Any]) -> None:
+        """Take over from a worker that was lost.
+
+        Args:
+            observations: The last observations. None if there are none.
+            seeds: The seed of each sub-environment's generator. None: the generator is random.
+        """
+        if observations is not None:
+            space = batch_space(self._space, len(self._part))
+            self._observations = list(iterate(space, observations))
+        for view, seed in zip(self.views, seeds, strict=False):
+            if seed is not None:
+                view.session.set_generator(np.random.default_rng(seed))
+
+    def report_lost(self, ended: list[bool], why: str) -> tuple[Any, ...]:
+        """End the episodes of a worker that was lost, or begin the next ones after an end.
+
+        Return the results in the form of ``step``.
+        """
+        infos = []
+        for place, number in enumerate(self._part):
+            info = {} if ended[place] else {"lost": True, "lost_why": why}
+            if info and self._mode == AutoresetMode.SAME_STEP:
+                infos.append((number, {"final_obs": self._observations[place], "final_info": info}))
+                info = {}
+            infos.append((number, info or self._begin(place)))
+        truncations = np.logical_not(ended)
+        rewards = np.zeros(len(ended), np.float64)
+        no_terminations = np.zeros(len(ended), np.bool_)
+        return self._stack_observations(), rewards, no_terminations, truncations, infos
 
     def _move(self, actions: Sequence[Action], ended: list[bool]) -> list[Episode]:
         """Step all episodes that have not just begun after an end; return all."""

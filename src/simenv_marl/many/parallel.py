@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from math import ceil, inf
@@ -246,6 +246,9 @@ def _work(
 
 # -- processes of a pool --------------------------------------------------------------------------
 
+Outcomes = dict[int, tuple[Any, BaseException | None]]
+"""By the number of a worker, its result, or None and its error."""
+
 SECONDS_TO_CLOSE: Final = 10.0
 """The seconds that a worker may take to close its object and to end."""
 
@@ -274,16 +277,22 @@ def _serve(connection: Connection, other_end: Connection | None, recipe: bytes) 
             each.abandon()
 
 
-def _call(served: list[Any], method: str, *args: object) -> Any:
+def call(served: list[Any], method: str, *args: object) -> Any:
     """In a worker, call a method of its object."""
     return getattr(served[0], method)(*args)
 
 
-class _Worker(Peer):
-    """A process with a part of the simulations."""
+class Worker(Peer):
+    """A process with a part of the simulations.
+
+    Attributes:
+        name: Its number, and the numbers of its simulations.
+        gone: How it has died. Empty while it lives.
+    """
 
     def __init__(self, context: Any, number: int, part: range, recipe: bytes) -> None:
         """Start the process."""
+        self.gone = ""
         self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
         connection, theirs = context.Pipe()
         super().__init__(connection)
@@ -306,6 +315,7 @@ class _Worker(Peer):
         self._process.join(1.0)  # its connection closes a moment before it ends
         code = self._process.exitcode
         how = "closed its pipe" if code is None else f"died with exit code {code}"
+        self.gone = f"{self.name} {how}"
         hint = ""
         if code == 1:  # an error has ended it before it could send a message
             hint = (
@@ -313,7 +323,7 @@ class _Worker(Peer):
                 " because each worker imports the script"
             )
         return WorkerError(
-            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts"
+            f"{self.gone}; it was killed, or a simulation ended the process. reset() starts"
             f" new workers{hint}"
         )
 
@@ -337,7 +347,10 @@ class WorkerPool:
     Attributes:
         failed: Whether an error has left the simulations at different steps, so that all of them
             need a reset.
+        restarts: The number of workers that were replaced after their death.
     """
+
+    restarts = 0
 
     def __init__(
         self,
@@ -381,7 +394,7 @@ class WorkerPool:
             ) from error
         self._context = context
         self._home = os.getpid()
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
         self._is_broken = True  # a worker is dead, or owes an answer because of an interrupt
         self.failed = False
         self._start()
@@ -395,35 +408,53 @@ class WorkerPool:
         """Start all workers, and have them make their objects."""
         try:
             for number, part in enumerate(self._parts):
-                self._workers.append(_Worker(self._context, number, part, self._recipes[number]))
-            self._exchange([])
+                self._workers.append(Worker(self._context, number, part, self._recipes[number]))
+            self._results(self._exchange(dict.fromkeys(range(len(self._parts)), b"")))
         except BaseException:
             self.abandon()
             raise
         self._is_broken = False
 
-    def _exchange(self, requests: Iterable[bytes], seconds: float = inf) -> list[Any]:
-        """Send each worker its request, if there are any. Return the results of the responses.
+    def _exchange(self, requests: Mapping[int, bytes], seconds: float = inf) -> Outcomes:
+        """Send workers, given by number, their requests, if these are not empty.
+
+        Return the result or the error of each. If one has died, the pool is broken.
 
         Raises:
             TimeoutError: Not all of them came within some seconds. The pool is broken.
-            WorkerError: A worker has died. The pool is broken.
-            BaseException: The first error of an object.
         """
         deadline = monotonic() + seconds
+        outcomes: Outcomes = {}
         try:
-            for worker, request in zip(self._workers, requests, strict=False):
-                worker.send(request)
-            responses = [worker.receive(deadline - monotonic()) for worker in self._workers]
+            for number, request in requests.items():
+                with suppress(WorkerError):  # ``receive`` raises it again
+                    if request:
+                        self._workers[number].send(request)
+            for number in requests:
+                try:
+                    response = self._workers[number].receive(deadline - monotonic())
+                except WorkerError as error:
+                    self._break()
+                    outcomes[number] = None, error
+                else:
+                    outcomes[number] = unpack_outcome(response)
         except BaseException:
-            self._is_broken = True
-            self.failed = True
+            self._break()
             raise
+        return outcomes
+
+    def _break(self) -> None:
+        """Note that the workers cannot go on until a reset."""
+        self._is_broken = True
+        self.failed = True
+
+    def _results(self, outcomes: Outcomes) -> list[Any]:
+        """Return the results in the order of the workers, or raise the first error."""
         results = []
-        for worker, response in zip(self._workers, responses, strict=True):
-            result, error = unpack_outcome(response)
+        for number, (result, error) in sorted(outcomes.items()):
             if error is not None:
-                annotate(error, f"simenv_marl: in {worker.name}")
+                if not self._workers[number].gone:
+                    annotate(error, f"simenv_marl: in {self._workers[number].name}")
                 raise error
             results.append(result)
         return results
@@ -455,17 +486,19 @@ class WorkerPool:
             raise WorkerError(
                 "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
             )
-        requests = []
-        for part in self._parts:
-            own = [_share_of(argument, part) for argument in arguments]
-            requests.append(pack_request(_call, method, *own))
+        shares = [[_share_of(argument, part) for argument in arguments] for part in self._parts]
         moves = method in ("reset", "step")
         if moves:
             self.failed = True  # until all simulations have moved
-        results = self._exchange(requests)
+        results = self._ask_all(method, shares)
         if moves:
             self.failed = False
         return results
+
+    def _ask_all(self, method: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
+        """Call a method of each worker's object, with a share of the arguments for each."""
+        requests = [pack_request(call, method, *share) for share in shares]
+        return self._results(self._exchange(dict(enumerate(requests))))
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds.
@@ -475,8 +508,8 @@ class WorkerPool:
         """
         try:
             if not self._is_broken and os.getpid() == self._home:
-                requests = [pack_request(_call, "close")] * len(self._workers)
-                self._exchange(requests, SECONDS_TO_CLOSE)
+                requests = dict.fromkeys(range(len(self._workers)), pack_request(call, "close"))
+                self._results(self._exchange(requests, SECONDS_TO_CLOSE))
         except (WorkerError, TimeoutError) as error:
             if not self._is_broken:
                 raise

@@ -6,7 +6,10 @@ import gc
 import multiprocessing
 import os
 import signal
+import time
 import warnings
+from collections import deque
+from itertools import repeat
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,6 +20,7 @@ from gymnasium.vector import AutoresetMode
 from simenv_marl import vector_env
 from simenv_marl.errors import OptionValueError, WorkerError
 from simenv_marl.many import restarts
+from tests.conftest import DRIVERS
 from tests.processes import alone, descriptors
 from tests.worlds.counters import (
     FORK,
@@ -258,6 +262,48 @@ def test_an_error_of_a_model_surfaces_although_another_worker_has_died():
         envs.step(ONES)
     envs.reset(seed=10)
     assert not envs.step(ONES)[3].any()
+
+
+def loop(seconds=60):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pass
+
+
+def loop_in_c():
+    deque(repeat(1), maxlen=0)  # looks for no signals
+
+
+@pytest.mark.parametrize(("hang", "why"), [(loop, "in loop\n"), (loop_in_c, "exit code 1")])
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_a_worker_that_takes_too_long_for_a_step_is_replaced(hang, why, driver, monkeypatch):
+    monkeypatch.setattr("simenv_marl.envs.vector_batch.SECONDS_TO_UNWIND", 0.3)
+    unharmed = play(restarting(), 3)
+    envs = restarting(mortal({(3, 2): hang}), step_timeout=0.3, driver=driver)
+    begun = time.monotonic()
+    with pytest.warns(UserWarning, match="restart 1"):
+        log = play(envs, 3)
+    assert time.monotonic() - begun < 5
+    for step, other in zip(log, unharmed, strict=True):
+        assert same(own(step, slice(2)), own(other, slice(2)))
+    infos = log[2][1]
+    assert infos["lost"].tolist() == [False, False, True, True]
+    assert why in infos["lost_why"][3]
+
+
+def test_a_reset_within_a_step_has_no_limit(monkeypatch):
+    monkeypatch.setattr("simenv_marl.envs.vector_batch.SECONDS_TO_UNWIND", 0.1)
+
+    class Slow(Mortal):
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            if seed not in range(4):
+                loop(0.5)
+
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+        envs = restarting(Slow, step_timeout=0.2, autoreset_mode=mode)
+        with warnings.catch_warnings(action="error"):
+            play(envs, 12)
 
 
 def test_restarts_need_workers():

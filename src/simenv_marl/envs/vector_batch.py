@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import faulthandler
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from ..core import (
     stacker,
 )
 from ..errors import InvalidActionError, annotate
+from ..hooks.limits import SECONDS_TO_UNWIND, StepAlarm
 from ..many.batch import step_all
 from .agents import OneAgentView
 from .base import ResetOptions
@@ -64,6 +67,10 @@ class SimulationBatch:
         self._mode = mode
         self._part = part
         self._shows = plan.options.shows
+        self._step_all = step_all
+        limit = plan.options.step_timeout
+        if limit is not None and plan.options.driver == "greenlet":  # threads limit each episode
+            self._step_all = partial(_step_in_time, limit)
         self.failed = False
         self._first: int | None = None  # the place that moves first in a reset or a step
         self._sessions: list[Session] = []
@@ -168,6 +175,13 @@ class SimulationBatch:
             infos,
         )
 
+    def exit_after(self, seconds: float) -> None:
+        """In a worker, end the process if the simulations take longer than some seconds to step.
+
+        They are in C code then, which no error ends.
+        """
+        self._step_all = partial(_step_or_exit, seconds, self._step_all)
+
     def take_over(self, observations: Observation, seeds: list[Any]) -> None:
         """Take over from a worker that was lost.
 
@@ -205,10 +219,10 @@ class SimulationBatch:
         if len(episodes) < len(self._sessions):  # a view was closed
             raise next(s.refusal() for s in self._sessions if s.episode is None)
         if self._first is not None:  # all of them move
-            step_all(episodes, actions, self._fail)
+            self._step_all(episodes, actions, self._fail)
             return episodes
         places = [place for place, is_over in enumerate(ended) if not is_over]
-        step_all(
+        self._step_all(
             [episodes[place] for place in places],
             [actions[place] for place in places],
             lambda index, error: self._fail(places[index], error),
@@ -285,6 +299,21 @@ class SimulationBatch:
             session.abandon()
 
 
+def _step_in_time(limit: float, *arguments: Any) -> None:
+    """Step many episodes, or raise a ``StepTimeoutError``."""
+    with StepAlarm(limit):
+        step_all(*arguments)
+
+
+def _step_or_exit(seconds: float, step: Callable[..., None], *arguments: Any) -> None:
+    """Step many episodes. After some seconds, print the stack and end the process."""
+    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
+    try:
+        step(*arguments)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
 def make_batch(
     simulation: Model,
     points: Points,
@@ -292,4 +321,8 @@ def make_batch(
     *arguments: Any,
 ) -> SimulationBatch:
     """Make a batch in a worker. ``arguments``: the ones of ``SimulationBatch`` after the plan."""
-    return SimulationBatch(plan_of(simulation, points, options), *arguments)
+    batch = SimulationBatch(plan_of(simulation, points, options), *arguments)
+    limit = options.get("step_timeout")
+    if limit is not None:
+        batch.exit_after(limit + 1.2 * SECONDS_TO_UNWIND)
+    return batch

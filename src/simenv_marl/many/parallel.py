@@ -320,7 +320,8 @@ class Worker(Peer):
         if code == 1:  # an error has ended it before it could send a message
             hint = (
                 '. In a script, make environments with workers under `if __name__ == "__main__":`,'
-                " because each worker imports the script"
+                " because each worker imports the script. With step_timeout=, C code may have taken"
+                " too long; then its stack is in stderr"
             )
         return WorkerError(
             f"{self.gone}; it was killed, or a simulation ended the process. reset() starts"

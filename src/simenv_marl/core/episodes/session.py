@@ -25,7 +25,7 @@ from ...errors import (
 )
 from ...hooks.handlers import Installation
 from ...hooks.places import homes_of, is_outdated
-from ...simulation import Model, make_simulation, optional_method, passing, takes
+from ...simulation import Action, Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -49,6 +49,20 @@ from .state import EpisodeState, State, UnmatchedNames
 
 MOST_SEEDS: Final = 100
 """How many seeds a reset tries until the one agent of a single view decides."""
+
+
+class LimitedEpisode(Episode):
+    """An episode whose steps have a time limit."""
+
+    __slots__ = ()
+
+    def step(self, action: Action, entered: bool = False) -> None:
+        """Take a step, or raise a ``StepTimeoutError``."""
+        if entered:
+            super().step(action, entered)
+            return
+        with self.driver.limit(self.plan.options.step_timeout or 0.0):
+            super().step(action)
 
 
 class Session(BaseSession):
@@ -269,7 +283,12 @@ class Session(BaseSession):
                 f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
                 " method time(); add one that returns its clock, or leave out discount_rate"
             )
-        self.episode = episode = Episode(
+        kind = Episode
+        limit = self.plan.options.step_timeout
+        if limit is not None:
+            self._driver.limit(limit)  # or an error here
+            kind = LimitedEpisode
+        self.episode = episode = kind(
             self, simulation, clock, self._driver, seed, replay, in_rounds=in_rounds
         )
         return simulation.run, self.handlers.with_agents(episode.agents.values())

@@ -356,6 +356,7 @@ def test_a_model_may_have_an_alarm_of_its_own():
 
 @ALARMS
 def test_a_mapping_that_takes_too_long_ends_as_well():
+    before = stacks()
     choose = decision(agent="ant", observation_space_mapping=lambda: [loop(len(slow)) or 0, 0])
     slow = []
 
@@ -370,12 +371,13 @@ def test_a_mapping_that_takes_too_long_ends_as_well():
     with pytest.raises(StepTimeoutError, match="in <lambda>"):
         env.step(1)
     env.close()
-    assert not stacks()
+    assert not stacks(before)
 
 
 @ALARMS
 @pytest.mark.parametrize(("inner", "outer"), [(0.1, 5), (5, 0.1), (None, 0.1)])
 def test_the_shorter_limit_of_two_environments_holds(inner, outer):
+    before = stacks()
     within, step = limited(step_timeout=inner)
     seen = []
 
@@ -396,7 +398,7 @@ def test_the_shorter_limit_of_two_environments_holds(inner, outer):
     assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
     env.close()
     within.close()
-    assert not stacks()
+    assert not stacks(before)
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])

@@ -10,7 +10,10 @@ import multiprocessing
 import os
 import signal
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from math import ceil, inf
@@ -173,11 +176,12 @@ def _shared(bar: ProgressBar) -> Iterator[str]:
 def spread(
     work: Callable[..., Result],
     arguments: tuple[object, ...],
-    items: Sequence[object],
+    items: Sequence[Any],
     workers: int,
     least: int,
     bar: ProgressBar,
     share: int = 4,
+    lost: Callable[[Any, WorkerError], Result] | None = None,
 ) -> list[Result]:
     """Work on items in this process, or on parts of them in processes of joblib.
 
@@ -189,6 +193,8 @@ def spread(
         least: The smallest number of items in a part, unless a worker would get none.
         bar: The progress bar.
         share: About how many parts each worker gets.
+        lost: Returns the result for an item whose process has died twice. None: the first death is
+            an error. If all of several items are lost, that is an error, too.
 
     Returns:
         The result of each part, in the order of the items.
@@ -199,32 +205,95 @@ def spread(
     processes = max(1, joblib.effective_n_jobs(workers))
     fewest = min(least, ceil(len(items) / processes))
     size = max(1, ceil(len(items) / (share * processes)), fewest)
-    parts = [items[start : start + size] for start in range(0, len(items), size)]
+    waiting = deque(items[start : start + size] for start in range(0, len(items), size))
     parcel = pack((work, arguments))
     backend, _ = joblib.parallel.get_active_backend()
     form = "generator" if backend.supports_return_generator else "list"
     # Outcomes are packed in the worker, because each backend passes errors on in its own way.
-    parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
+    settings = {"batch_size": 1, "return_as": form, "pre_dispatch": "n_jobs"}
     call = joblib.delayed(pack_outcome)
     results: list[Result] = []
+    news: list[WorkerError] = []
     with _shared(bar) as path:
-        outcomes = parallel(call(_work, parcel, os.getpid(), path, part) for part in parts)
-        try:
-            for _, outcome in zip(parts, outcomes, strict=True):
-                returned, error = unpack_outcome(outcome)
-                if error is not None:
-                    raise error
-                result, counts, missing = returned
-                results.append(result)
-                for token, numbers in counts.items():
-                    count(token, **numbers)
-                if missing:
-                    _SharedBar(path).update(missing)
-        finally:
-            if form == "generator":
-                with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
-                    outcomes.close()  # cancels the remaining work
+        task = _work, parcel, os.getpid(), path
+        while waiting:
+            begun: deque[Sequence[Any]] = deque()
+            parallel = joblib.Parallel(n_jobs=workers, **settings)
+            outcomes = parallel(call(*task, part) for part in _moved(waiting, begun))
+            try:
+                for outcome in outcomes:
+                    results.append(_received(outcome, path))
+                    begun.popleft()
+            except BrokenProcessPool:
+                if lost is None:
+                    raise
+            finally:
+                if form == "generator":
+                    with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
+                        outcomes.close()  # cancels the remaining work
+            again = [item for part in begun for item in part]
+            for item, outcome in zip(again, _run_alone(task, again, processes), strict=True):
+                if outcome is not None:
+                    results.append(_received(outcome, path))
+                elif lost is not None:
+                    news.append(WorkerError(f"the process of {item!r} has died twice"))
+                    results.append(lost(item, news[-1]))
+    if 1 < len(items) == len(news):
+        raise news[0]
     return results
+
+
+def _moved(waiting: deque[Result], begun: deque[Result]) -> Iterator[Result]:
+    """Yield items of a queue, each when it has moved to another."""
+    while waiting:
+        begun.append(waiting.popleft())
+        yield begun[-1]
+
+
+def _received(outcome: bytes, path: str) -> Any:
+    """Return the result of ``_work``, or raise its error. ``path`` is for a ``_SharedBar``."""
+    returned, error = unpack_outcome(outcome)
+    if error is not None:
+        raise error
+    result, counts, missing = returned
+    for token, numbers in counts.items():
+        count(token, **numbers)
+    if missing:
+        _SharedBar(path).update(missing)
+    return result
+
+
+def _run_alone(task: tuple[Any, ...], items: Sequence[Any], processes: int) -> list[bytes | None]:
+    """Work on each item in a process without others, because they may not be to blame.
+
+    Return the outcomes; None for one whose process has died twice.
+    """
+    if not items:
+        return []
+    loky = import_module("joblib.externals.loky")
+    pools = [loky.ProcessPoolExecutor(1) for _ in range(min(processes, len(items)))]
+    idle = [*pools]
+
+    def run(item: Any) -> bytes | None:
+        pool = idle.pop()
+        outcome = None
+        for _ in range(2):
+            try:
+                outcome = pool.submit(pack_outcome, *task, [item]).result()
+                break
+            except BrokenProcessPool:
+                pool = loky.ProcessPoolExecutor(1)
+                pools.append(pool)
+        idle.append(pool)
+        return outcome
+
+    with ThreadPoolExecutor(len(pools)) as threads:
+        try:
+            return list(threads.map(run, items))
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
+            for pool in pools:
+                pool.shutdown(kill_workers=True)
 
 
 def _work(

@@ -12,7 +12,6 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
@@ -47,6 +46,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from .alone import run_alone
 
 Result = TypeVar("Result")
 
@@ -232,7 +232,7 @@ def spread(
                     with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
                         outcomes.close()  # cancels the remaining work
             again = [item for part in begun for item in part]
-            for item, outcome in zip(again, _run_alone(task, again, processes), strict=True):
+            for item, outcome in zip(again, run_alone(task, again, processes), strict=True):
                 if outcome is not None:
                     results.append(_received(outcome, path))
                 elif lost is not None:
@@ -261,39 +261,6 @@ def _received(outcome: bytes, path: str) -> Any:
     if missing:
         _SharedBar(path).update(missing)
     return result
-
-
-def _run_alone(task: tuple[Any, ...], items: Sequence[Any], processes: int) -> list[bytes | None]:
-    """Work on each item in a process without others, because they may not be to blame.
-
-    Return the outcomes; None for one whose process has died twice.
-    """
-    if not items:
-        return []
-    loky = import_module("joblib.externals.loky")
-    pools = [loky.ProcessPoolExecutor(1) for _ in range(min(processes, len(items)))]
-    idle = [*pools]
-
-    def run(item: Any) -> bytes | None:
-        pool = idle.pop()
-        outcome = None
-        for _ in range(2):
-            try:
-                outcome = pool.submit(pack_outcome, *task, [item]).result()
-                break
-            except BrokenProcessPool:
-                pool = loky.ProcessPoolExecutor(1)
-                pools.append(pool)
-        idle.append(pool)
-        return outcome
-
-    with ThreadPoolExecutor(len(pools)) as threads:
-        try:
-            return list(threads.map(run, items))
-        finally:
-            threads.shutdown(wait=False, cancel_futures=True)
-            for pool in pools:
-                pool.shutdown(kill_workers=True)
 
 
 def _work(

@@ -47,7 +47,7 @@ class RestartingPool(WorkerPool):
         self._replaced: Counter[int] = Counter()  # by number of the worker
         self._lost: dict[int, str] = {}  # why a worker's episodes are lost, until a step reports it
         self._latest: dict[int, Any] = {}  # the last observations of each worker
-        self._seeds: dict[int, list[Any]] = {}  # of the last reset of each worker
+        self._seeds: dict[int, list[Any]] = {}  # of each worker's last reset with seeds
         super().__init__(make, arguments, *others)
 
     def _ask_all(self, method: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
@@ -57,8 +57,6 @@ class RestartingPool(WorkerPool):
             WorkerError: More workers than allowed have died within an hour. The pool is broken.
         """
         had_failed = self.failed
-        if method == "reset":
-            self._note_seeds(shares)
         outcomes: Outcomes = {}
         news = []
         missing = [*range(len(shares))]
@@ -93,14 +91,9 @@ class RestartingPool(WorkerPool):
             self._latest[number] = result[0]
             if method == "step" or shares[number][-1].all():
                 self._lost.pop(number, None)
+            if method == "reset" and any(seed is not None for seed in shares[number][0]):
+                self._seeds[number] = shares[number][0]
         return results
-
-    def _note_seeds(self, shares: Sequence[Sequence[Any]]) -> None:
-        """Note the seeds of a reset, from which those of new workers follow."""
-        for number, (seeds, *_) in enumerate(shares):
-            before = self._seeds.get(number, seeds)
-            pairs = zip(seeds, before, strict=True)
-            self._seeds[number] = [old if new is None else new for new, old in pairs]
 
     def _replace(self, number: int, why: str) -> str:
         """Start a new worker in place of one that was lost. Return the text of a warning."""
@@ -125,7 +118,7 @@ class RestartingPool(WorkerPool):
             latest = self._latest.get(number)
             if latest is not None:
                 self._lost[number] = why
-            # Those of other workers do not follow from these.
+            # They do not depend on when it was lost.
             seeds = [
                 None if seed is None else [seed, self._replaced[number]]
                 for seed in self._seeds.get(number, ())

@@ -122,8 +122,8 @@ def simulate_many(
 
     Returns:
         The collected value of each seed, in the order of the seeds. With workers, runs whose
-        process dies (killed, out of memory, a crash in C) are run again, once, each alone. The
-        value of one that is lost again is a ``WorkerError``.
+        process dies (killed, out of memory, a crash in C) are run again, each alone. One that ends
+        its process then is run again once. If it is lost again, its value is a ``WorkerError``.
 
     Raises:
         OptionValueError: An argument has an invalid value.

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 import traceback
+from random import Random
 
 import numpy as np
 import pytest
@@ -126,6 +127,7 @@ HANGS = {"loop": loop, "swallow errors": swallow_errors}
 @pytest.mark.parametrize("hang", HANGS)
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_step_that_loops_for_ever_ends_with_the_models_stack(view, hang):
+    before = set(threading.enumerate())
     env, step = limited(view)
     env.reset(seed=4, options={"how": HANGS[hang]})
     step(1)
@@ -148,7 +150,7 @@ def test_a_step_that_loops_for_ever_ends_with_the_models_stack(view, hang):
     assert nobody_is_asked()
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
-    assert [each.name for each in threading.enumerate() if each.name == "simulation"] == []
+    assert set(threading.enumerate()) <= before
 
 
 def test_a_model_unwinds_and_its_finally_blocks_run():
@@ -248,6 +250,27 @@ def test_an_episode_that_took_too_long_is_a_file_up_to_there(tmp_path):
         step(3)
     save_episode(env, tmp_path / "late.jsonl")
     assert "StepTimeoutError" in (tmp_path / "late.jsonl").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("view", [view for view in VIEWS if view != "workers"])
+def test_a_limit_may_end_a_step_at_any_moment(view):
+    before = set(threading.enumerate())
+    random, late = Random(0), 0
+    for seed in range(40):
+        env, step = limited(view, step_timeout=random.choice([1e-5, 3e-5, 1e-4]) * random.random())
+        for _ in range(3):
+            env.reset(seed=seed)
+            try:
+                for _ in range(10):
+                    step(1)
+            except StepTimeoutError:
+                late += 1
+            assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+            assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+        env.close()
+    assert late
+    assert nobody_is_asked()
+    assert set(threading.enumerate()) <= before
 
 
 # -- signals --------------------------------------------------------------------------------------

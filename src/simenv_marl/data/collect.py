@@ -125,8 +125,8 @@ def collect_episodes(
     Returns:
         A dict from each key of ``policies`` to the trajectories of the agents of its policy. Of a
         policy for all agents (``turn_policy``): from the name of each decision point. With workers,
-        an episode whose process dies is played again, once. One that is lost again is left out, and
-        its seed is in ``lost``.
+        lost episodes are played again, as in ``simulate_many``. One that is lost again is left out,
+        and its seed is in ``lost``.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.

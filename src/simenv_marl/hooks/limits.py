@@ -28,7 +28,7 @@ def step_timeout_error(seconds: float, frame: FrameType | None) -> StepTimeoutEr
 class StepAlarm:
     """A context in which a step ends by an error when its time is over.
 
-    It lends itself the timer and the handler of SIGALRM. Those of the user go on meanwhile.
+    It borrows the timer and the handler of SIGALRM. The user's own alarms still ring meanwhile.
     """
 
     __slots__ = ("_end", "_handler", "_interval", "_late", "_next", "_seconds")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any, Final
@@ -44,7 +44,6 @@ class RestartingPool(WorkerPool):
         """
         self._most = most
         self._deaths: deque[float] = deque()
-        self._replaced: Counter[int] = Counter()  # by number of the worker
         self._lost: dict[int, str] = {}  # why a worker's episodes are lost, until a step reports it
         self._latest: dict[int, Any] = {}  # the last observations of each worker
         self._seeds: dict[int, list[Any]] = {}  # of each worker's last reset with seeds
@@ -110,7 +109,6 @@ class RestartingPool(WorkerPool):
                     f" most_restarts={self._most}; reset() starts new workers"
                 )
             self.restarts += 1
-            self._replaced[number] += 1
             text = (
                 f"{why}. Its episodes are lost, and new ones begin in a new worker; restart"
                 f" {len(self._deaths)} within an hour, of most_restarts={self._most}"
@@ -118,9 +116,9 @@ class RestartingPool(WorkerPool):
             latest = self._latest.get(number)
             if latest is not None:
                 self._lost[number] = why
-            # They do not depend on when it was lost.
+            # The seeds of other workers do not depend on them.
             seeds = [
-                None if seed is None else [seed, self._replaced[number]]
+                None if seed is None else [seed, self.restarts]
                 for seed in self._seeds.get(number, ())
             ]
             recipe = pack_plainly((remake, (self._recipes[number], latest, seeds)))

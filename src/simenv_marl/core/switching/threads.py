@@ -26,10 +26,10 @@ from .exits import LoopExit, SimulationExit
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds, because Ctrl-C may come before it."""
 
-_raise_in: Final = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_ulong, ctypes.py_object)(
+_raise_in: Final = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)(
     ("PyThreadState_SetAsyncExc", ctypes.pythonapi)
 )
-"""Raises an error in a thread, at its next instruction in Python."""
+"""Raises an error, given by the address of its class, in a thread. None: not any more."""
 
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
@@ -119,13 +119,17 @@ class ThreadDriver(Driver):
         Return its next event.
         """
         self._replies.put(_EXIT)
-        is_late = self._limit is not None and monotonic() > self._limit[0]
-        if is_late and self._thread is not None and self.frame is None:  # a loop never gets it
-            _raise_in(self._thread.ident, LoopExit)
+        late = 0
+        if self._limit is not None and monotonic() > self._limit[0] and self.frame is None:
+            late = getattr(self._thread, "ident", 0)  # it may be in a loop, without decisions
+            _raise_in(late, id(LoopExit))
         try:
-            return self._arrived.get(self._deadlock is None, SECONDS_TO_UNWIND)
+            event = self._arrived.get(self._deadlock is None, SECONDS_TO_UNWIND)
         except Empty:
             return None
+        if late:
+            _raise_in(late, None)
+        return event
 
     def end(self) -> None:
         """End the stack, and join its thread. After an interrupt this can be called again.
@@ -153,12 +157,14 @@ class ThreadDriver(Driver):
             self._arrived.put(ENDED)
             return
         try:
-            while not self.ended and (reply := self._replies.get()) is not _END:
-                if reply is _JOB:
-                    self._do()
-                reply = None
-        except SimulationExit:  # of a late step, which has ended meanwhile
-            pass
+            while not self.ended:
+                with suppress(SimulationExit):  # that came after the end of its job
+                    reply = self._replies.get()
+                    if reply is _END:
+                        break
+                    if reply is _JOB:
+                        self._do()
+                    reply = None
         finally:
             self._forget_stack()
 

@@ -136,7 +136,8 @@ OPTIONS = {field.name for field in fields(Options)}
 
 def test_type_checkers_know_the_options_that_there_are():
     assert set(ViewOptions.__annotations__) == OPTIONS
-    assert set(EpisodeOptions.__annotations__) == OPTIONS - {"policies", "record", "record_all"}
+    views = {"policies", "record", "record_all", "step_timeout"}
+    assert set(EpisodeOptions.__annotations__) == OPTIONS - views
     assert set(CheckOptions.__annotations__) == OPTIONS - {"max_steps"}
 
 

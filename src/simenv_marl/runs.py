@@ -17,7 +17,7 @@ from .core import (
     reuse_resources,
 )
 from .envs.single import plan_of
-from .errors import OptionValueError, close_after, short_repr
+from .errors import OptionValueError, WorkerError, close_after, short_repr
 from .many.batch import BatchRun, policy_keys
 from .many.parallel import ProgressBar, import_extra, progress_bar, spread
 from .simulation import Model, check_count
@@ -121,12 +121,15 @@ def simulate_many(
         **options: The options of ``simulate``.
 
     Returns:
-        The collected value of each seed, in the order of the seeds.
+        The collected value of each seed, in the order of the seeds. With workers, runs whose
+        process dies (killed, out of memory, a crash in C) are run again, each alone. One that ends
+        its process then is run again once. If it is lost again, its value is a ``WorkerError``.
 
     Raises:
         OptionValueError: An argument has an invalid value.
         InvalidActionError: A policy did not return one legal action for each decision.
         MissingExtraError: joblib or tqdm is missing.
+        WorkerError: All of several runs are lost.
         SimEnvError: Another argument is invalid. The message says which.
         BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note
             that names the seed. All other simulations are unwound first.
@@ -137,8 +140,13 @@ def simulate_many(
     plan = _make_plan(*episodes)  # errors are raised before any work starts
     arguments = episodes, None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(all_seeds), progress) as bar:
-        parts = spread(_simulate, arguments, all_seeds, workers, batch_size, bar)
+        parts = spread(_simulate, arguments, all_seeds, workers, batch_size, bar, lost=_lost)
     return list(chain.from_iterable(parts))
+
+
+def _lost(seed: int, error: WorkerError) -> list[Model]:
+    """Return the results of a run that was lost twice."""
+    return [error]
 
 
 def _make_plan(

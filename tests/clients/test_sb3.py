@@ -1,22 +1,32 @@
 """Stable-Baselines3 and sb3-contrib: single views, joint views, goals, masks."""
 
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from bakery_env import FourWeeks
 from examples.greenhouse_coop import env as greenhouse
 from gymnasium import spaces
 from hive import DEFINITION, HiveSim, points
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from simenv_marl import TRUNCATED, joint_env, make_step, single_env
+from simenv_marl import TRUNCATED, joint_env, make_step, single_env, vector_env
+from tests.processes import descriptors
 
 from . import page
 
@@ -95,6 +105,129 @@ def test_vectors_in_one_process_and_in_many_learn_the_same():
         envs.close()
         learnt.append(worth(model, two_bees()))
     assert learnt[0] == learnt[1]
+
+
+BATCH = "bakery.Bakery.choose_batch"
+
+
+class Vector(VecEnv):
+    """A vector environment of Gymnasium, with ``SAME_STEP``, for Stable-Baselines3.
+
+    It notes the episodes of each simulation, up to the first that is lost.
+    """
+
+    def __init__(self, envs):
+        self.envs, self.lost = envs, 0
+        self.episodes = [[] for _ in range(envs.num_envs)]
+        self.is_whole = np.ones(envs.num_envs, bool)
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self):
+        return self.envs.reset(seed=0)[0]
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        observations, rewards, terminations, truncations, infos = self.envs.step(self.actions)
+        ends = terminations | truncations
+        final = infos.get("final_info", {})
+        lost = np.asarray(final.get("lost", np.zeros(self.num_envs, bool)))
+        assert not (lost & ~truncations).any()
+        self.lost += lost.sum()
+        self.is_whole &= ~lost
+        each = [{"TimeLimit.truncated": bool(truncated)} for truncated in truncations]
+        for place in range(self.num_envs):
+            if ends[place]:
+                each[place]["terminal_observation"] = infos["final_obs"][place]
+            if self.is_whole[place]:
+                seen = observations[place].tolist(), rewards[place], ends[place]
+                self.episodes[place].append((self.actions[place].tolist(), *seen))
+        return observations, rewards, ends, each
+
+    def close(self):
+        self.envs.close()
+
+    def get_attr(self, name, indices=None):
+        return [getattr(self.envs, name)] * self.num_envs
+
+    def set_attr(self, name, value, indices=None):
+        raise NotImplementedError
+
+    def env_method(self, name, *args, indices=None, **kwargs):
+        raise NotImplementedError
+
+    def env_is_wrapped(self, kind, indices=None):
+        return [False] * self.num_envs
+
+
+def kill_workers(seconds, every, ended):
+    """Kill a random worker again and again for some seconds; return how many."""
+    number, until = 0, time.monotonic() + seconds
+    random = np.random.default_rng(0)
+    while time.monotonic() < until and not ended.wait(every):
+        there = [each for each in multiprocessing.active_children() if "worker" in each.name]
+        if there:
+            os.kill(random.choice([each.pid for each in there]), signal.SIGKILL)
+            number += 1
+    ended.wait(every)  # the last one is noticed
+    ended.set()
+    return number
+
+
+class Deaths(BaseCallback):
+    """Ends a training some time after the last death."""
+
+    def __init__(self, ended):
+        super().__init__()
+        self.ended = ended
+
+    def _on_step(self):
+        return not self.ended.is_set()
+
+
+@pytest.mark.parametrize("seconds", [int(os.environ.get("SECONDS_OF_DEATHS", "9"))])
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="descriptors are not told of")
+def test_a_training_survives_the_deaths_of_workers(seconds):
+    def learn(kill):
+        envs = Vector(
+            vector_env(
+                FourWeeks,
+                BATCH,
+                num_envs=4,
+                workers=2,
+                restart=True,
+                most_restarts=100,
+                autoreset_mode="SameStep",
+            )
+        )
+        model = PPO("MlpPolicy", envs, n_steps=64, batch_size=64, seed=0)
+        ended = threading.Event()
+        with ThreadPoolExecutor(1) as killer:
+            killed = killer.submit(kill_workers, seconds, 3.0, ended) if kill else None
+            model.learn(10**9 if kill else 512, callback=Deaths(ended))
+        envs.close()
+        return envs, 0 if killed is None else killed.result()
+
+    learn(False)
+    before = descriptors(), threading.active_count()
+    with pytest.warns(UserWarning, match="restart"):
+        envs, deaths = learn(True)
+    assert deaths >= seconds // 3 - 1
+    assert envs.envs.restarts == deaths
+    assert envs.lost == 2 * deaths
+    assert (descriptors(), threading.active_count()) == before
+    assert [each.name for each in multiprocessing.active_children() if "worker" in each.name] == []
+    # Each simulation, played with the same actions in this process, tells the same.
+    for place, steps in enumerate(envs.episodes):
+        env = vector_env(FourWeeks, BATCH, num_envs=1, autoreset_mode="SameStep")
+        env.reset(seed=place)
+        for action, *seen in steps:
+            observations, rewards, terminations, truncations, _ = env.step(np.array([action]))
+            ends = terminations | truncations
+            assert [observations[0].tolist(), rewards[0], ends[0]] == seen
+        env.close()
+        print(f"{len(steps)} steps of simulation {place}, {deaths} deaths")
 
 
 def test_hindsight_replay_learns_a_goal():

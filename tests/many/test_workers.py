@@ -17,7 +17,7 @@ from joblib._parallel_backends import ThreadingBackend
 
 from simenv_marl import RULE, difference, simulate_many
 from simenv_marl.data import collect_episodes
-from simenv_marl.errors import InvalidActionError
+from simenv_marl.errors import InvalidActionError, WorkerError
 from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
@@ -436,3 +436,66 @@ def test_bar_counts_episodes_of_workers_that_cannot_reach_its_file(capsys, monke
     with joblib.parallel_config(backend="threading"):
         simulate_many(Shop, seeds=range(8), workers=2, batch_size=2, progress=True)
     assert "8/8" in capsys.readouterr().err
+
+
+# -- workers that die -----------------------------------------------------------------------------
+
+
+class Doomed(Shop):
+    """A shop whose process ends in the run of some seeds: always, or once for each of a folder."""
+
+    def __init__(self, folder, always=(), once=()):
+        super().__init__()
+        self.folder, self.always, self.once = folder, always, once
+
+    def reset(self, seed):
+        super().reset(seed)
+        self.own_seed = seed
+
+    def run(self):
+        path = self.folder / str(self.own_seed)
+        with path.open("a") as file:
+            file.write("x")
+        if self.own_seed in self.always or (
+            self.own_seed in self.once and path.stat().st_size == 1
+        ):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().run()
+
+
+def doomed(folder, **ends):
+    return partial(Doomed, folder, **ends)
+
+
+def seed_of(simulation):
+    return simulation.own_seed
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+@pytest.mark.parametrize("batch_size", [1, 1024])
+def test_lost_runs_are_run_again_once_each_alone(batch_size, tmp_path):
+    given = {"seeds": range(24), "workers": 2, "batch_size": batch_size, "collect": seed_of}
+    found = simulate_many(doomed(tmp_path, always=(3,), once=(0, 7, 8, 21)), **given)
+    assert isinstance(found[3], WorkerError)
+    assert "3" in str(found[3])
+    found[3] = 3
+    assert found == [*range(24)]
+    assert len((tmp_path / "3").read_text()) in (2, 3)  # it may not have begun at the first death
+    with pytest.raises(WorkerError, match="died twice"):
+        simulate_many(doomed(tmp_path, always=(1, 2)), seeds=[1, 2], workers=2)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+def test_lost_episodes_are_left_out_of_trajectories(tmp_path):
+    given = {"points": shops.POINTS, "collect": seed_of, "batch_size": 2}
+    model, policies = doomed(tmp_path, always=(2, 9), once=(4,)), {"keeper": ones}
+    found = collect_episodes(model, policies, seeds=range(12), workers=2, **given)["keeper"]
+    seeds = [seed for seed in range(12) if seed not in (2, 9)]
+    whole = collect_episodes(doomed(tmp_path), policies, seeds=seeds, **given)["keeper"]
+    assert found.lost == (2, 9)
+    assert whole.lost == ()
+    assert same(
+        {**vars(found), "lost": (), "lengths": None}, {**vars(whole), "lost": (), "lengths": None}
+    )
+    one = collect_episodes(model, policies, seeds=[9], workers=2, **given)["keeper"]
+    assert (len(one), one.seeds, one.lost, one.collected) == (0, (), (9,), ())

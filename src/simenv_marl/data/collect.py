@@ -34,6 +34,7 @@ from ..envs.single import plan_of
 from ..errors import (
     DefinitionError,
     OptionValueError,
+    WorkerError,
     name_of,
     short_repr,
 )
@@ -43,7 +44,7 @@ from ..many.batch import (
     PolicyKey,
     policy_keys,
 )
-from ..many.parallel import progress_bar, spread
+from ..many.parallel import NO_BAR, progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
 from ..simulation import (
     EVERYONE,
@@ -123,7 +124,9 @@ def collect_episodes(
 
     Returns:
         A dict from each key of ``policies`` to the trajectories of the agents of its policy. Of a
-        policy for all agents (``turn_policy``): from the name of each decision point.
+        policy for all agents (``turn_policy``): from the name of each decision point. With workers,
+        lost episodes are played again, as in ``simulate_many``. One that is lost again is left out,
+        and its seed is in ``lost``.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
@@ -139,14 +142,23 @@ def collect_episodes(
     check_options(batch_size, workers, collect, concurrency)
     make_plan = partial(learners_plan, simulation, policies, points, options)
     arguments = make_plan, list(policies), collect, batch_size, concurrency
+    lost: list[int] = []
+
+    def lose(episode: tuple[int, int], error: WorkerError) -> Any:
+        lost.append(episode[0])
+        return _play(*arguments, [], NO_BAR)
+
+    items = list(enumerate(seed_list))
     with progress_bar(len(seed_list), progress) as bar:
-        parts = spread(_play, arguments, list(enumerate(seed_list)), workers, batch_size, bar)
+        parts = spread(_play, arguments, items, workers, batch_size, bar, lost=lose)
     collected = None
     if collect is not None:
         collected = tuple(chain.from_iterable(values for _, values, _ in parts))
     errors = tuple(chain.from_iterable(texts for *_, texts in parts))
     return {
-        key: combine([records[place] for records, *_ in parts], tuple(seed_list), collected, errors)
+        key: combine(
+            [records[place] for records, *_ in parts], tuple(seed_list), collected, errors, lost
+        )
         for place, key in enumerate(policies)
     }
 

@@ -133,6 +133,8 @@ class Trajectories:
             seeds. None where there was no ``collect``.
         errors: For each seed, the reason why the numbers of its episode are wrong, as
             ``run_experiment`` tells it. Empty where none is known.
+        lost: The seeds of the episodes that have ended their worker process twice. They are in no
+            other attribute.
     """
 
     _: KW_ONLY
@@ -163,6 +165,7 @@ class Trajectories:
     action_labels: Sequence[str] | Mapping[Any, str] | None = None
     collected: tuple[Any, ...] | None = None
     errors: tuple[str, ...] = ()
+    lost: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         """Return N, the number of decisions."""
@@ -238,10 +241,12 @@ def combine(
     seeds: tuple[int, ...],
     collected: tuple[Any, ...] | None = None,
     errors: tuple[str, ...] = (),
+    lost: Sequence[int] = (),
 ) -> Trajectories:
     """Combine the records of one policy in consecutive parts of the episodes.
 
-    ``seeds``, ``collected`` and ``errors`` have an item for each episode of all parts.
+    ``seeds`` has an item for each episode, ``collected`` and ``errors`` for each but those with the
+    numbers ``lost``.
     """
     nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in nonempty])
@@ -252,6 +257,7 @@ def combine(
     starts = np.flatnonzero(np.append(True, is_last)[:-1])
     lengths = np.diff(starts, append=len(agents))
     decisions |= {
+        "episodes": decisions["episodes"] - np.searchsorted(lost, decisions["episodes"]),
         "agents": np.array(agents, np.int64),
         "last_turns": decisions["last_turns"][is_last],
         "steps": np.arange(len(agents)) - np.repeat(starts, lengths),
@@ -261,7 +267,8 @@ def combine(
         **nonempty[0].point,
         **joined([part.ends for part in nonempty]),
         starts=starts,
-        seeds=seeds,
+        seeds=tuple(seed for number, seed in enumerate(seeds) if number not in lost),
+        lost=tuple(seeds[number] for number in lost),
         names=tuple(codes),
         collected=collected,
         errors=errors,

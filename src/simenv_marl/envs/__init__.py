@@ -180,6 +180,8 @@ def vector_env(
     copy: bool = True,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     context: Any = None,
+    restart: bool = False,
+    most_restarts: int = 10,
     **options: Unpack[ViewOptions],
 ) -> SimulationVectorEnv:
     """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
@@ -198,6 +200,11 @@ def vector_env(
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
         context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a
             context of ``multiprocessing``.
+        restart: Whether a worker that dies, or exceeds ``step_timeout``, is replaced. The episodes
+            of its simulations end truncated: with the last observation, reward 0 and, in the info,
+            ``lost`` and ``lost_why`` (in ``final_info`` with ``SAME_STEP``). A warning tells of it.
+            Others do not notice. Otherwise, ``step`` raises a ``WorkerError``.
+        most_restarts: How many workers may be replaced within an hour. One more is an error.
         {options}
     """
     return SimulationVectorEnv(
@@ -210,4 +217,6 @@ def vector_env(
         copy=copy,
         autoreset_mode=autoreset_mode,
         context=context,
+        restart=restart,
+        most_restarts=most_restarts,
     )

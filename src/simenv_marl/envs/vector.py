@@ -3,6 +3,7 @@
 import weakref
 from collections.abc import Mapping, Sequence, Sized
 from copy import deepcopy
+from functools import partial
 from itertools import chain
 from multiprocessing.context import BaseContext
 from threading import Lock
@@ -36,6 +37,7 @@ from ..errors import (
     short_repr,
 )
 from ..many.parallel import WorkerPool
+from ..many.restarts import RestartingPool
 from ..simulation import RULE, check_count
 from .agents import OneAgentView
 from .base import ResetOptions
@@ -103,6 +105,8 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         copy: bool,
         autoreset_mode: AutoresetMode | str,
         context: BaseContext | str | None,
+        restart: bool,
+        most_restarts: int,
     ) -> None:
         """Make the environment. ``vector_env`` explains the arguments.
 
@@ -112,6 +116,9 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         super().__init__()
         self.num_envs = check_count(num_envs, "num_envs", 1)
         workers = check_count(workers, "workers")
+        check_count(most_restarts, "most_restarts")
+        if restart and not workers:
+            raise OptionValueError("restart=True restarts workers, and needs workers=")
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -151,7 +158,8 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             if points is None and names == decision_points():  # others may be there
                 points = names
             arguments = simulation, points, options, *settings
-            self._simulations = WorkerPool(make_batch, arguments, self.num_envs, workers, context)
+            kind_of_pool = partial(RestartingPool, most_restarts) if restart else WorkerPool
+            self._simulations = kind_of_pool(make_batch, arguments, self.num_envs, workers, context)
             self._stack = stacker(self.single_observation_space, cast=True)
             self._stacked = create_empty_array(self.single_observation_space, self.num_envs)
         else:
@@ -339,6 +347,11 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         return mask, others
 
     # -- the simulations --------------------------------------------------------------------------
+
+    @property
+    def restarts(self) -> int:
+        """The number of workers that were lost and replaced, with ``restart=True``."""
+        return self._simulations.restarts
 
     @property
     def envs(self) -> list[OneAgentView]:

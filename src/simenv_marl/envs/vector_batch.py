@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import faulthandler
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import create_empty_array
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from ..core import (
@@ -25,6 +27,7 @@ from ..core import (
     stacker,
 )
 from ..errors import InvalidActionError, annotate
+from ..hooks.limits import SECONDS_TO_UNWIND, StepAlarm
 from ..many.batch import step_all
 from .agents import OneAgentView
 from .base import ResetOptions
@@ -43,7 +46,10 @@ class SimulationBatch:
     Attributes:
         views: The Gymnasium environments of the sub-environments.
         failed: Whether an error has left them at different steps, so that all of them need a reset.
+        restarts: 0, as there are no workers.
     """
+
+    restarts = 0
 
     def __init__(
         self,
@@ -61,6 +67,10 @@ class SimulationBatch:
         self._mode = mode
         self._part = part
         self._shows = plan.options.shows
+        self._step_all = step_all
+        limit = plan.options.step_timeout
+        if limit is not None and plan.options.driver == "greenlet":  # threads limit each episode
+            self._step_all = partial(_step_in_time, limit)
         self.failed = False
         self._first: int | None = None  # the place that moves first in a reset or a step
         self._sessions: list[Session] = []
@@ -73,6 +83,7 @@ class SimulationBatch:
                 self.abandon()
                 raise
         self._view = view
+        self._space = space
         self.views = [view.of_session(session) for session in self._sessions]
         self._stack = stacker(space, cast=True)
         self._stacked = create_empty_array(space, len(part))
@@ -164,16 +175,54 @@ class SimulationBatch:
             infos,
         )
 
+    def exit_after(self, seconds: float) -> None:
+        """In a worker, end the process if the simulations take longer than some seconds to step.
+
+        They are in C code then, which no error ends.
+        """
+        self._step_all = partial(_step_or_exit, seconds, self._step_all)
+
+    def take_over(self, observations: Observation, seeds: list[Any]) -> None:
+        """Take over from a worker that was lost.
+
+        Args:
+            observations: The last observations. None if there are none.
+            seeds: The seed of each sub-environment's generator. None: the generator is random.
+        """
+        if observations is not None:
+            space = batch_space(self._space, len(self._part))
+            self._observations = list(iterate(space, observations))
+        for view, seed in zip(self.views, seeds, strict=False):
+            if seed is not None:
+                view.session.set_generator(np.random.default_rng(seed))
+
+    def report_lost(self, ended: list[bool], why: str) -> tuple[Any, ...]:
+        """End the episodes of a worker that was lost, or begin the next ones after an end.
+
+        Return the results in the form of ``step``.
+        """
+        infos = []
+        for place, number in enumerate(self._part):
+            info = {} if ended[place] else {"lost": True, "lost_why": why}
+            if info and self._mode == AutoresetMode.SAME_STEP:
+                infos.append((number, {"final_obs": self._observations[place], "final_info": info}))
+                info = {}
+            infos.append((number, info or self._begin(place)))
+        truncations = np.logical_not(ended)
+        rewards = np.zeros(len(ended), np.float64)
+        no_terminations = np.zeros(len(ended), np.bool_)
+        return self._stack_observations(), rewards, no_terminations, truncations, infos
+
     def _move(self, actions: Sequence[Action], ended: list[bool]) -> list[Episode]:
         """Step all episodes that have not just begun after an end; return all."""
         episodes = [session.episode for session in self._sessions if session.episode]
         if len(episodes) < len(self._sessions):  # a view was closed
             raise next(s.refusal() for s in self._sessions if s.episode is None)
         if self._first is not None:  # all of them move
-            step_all(episodes, actions, self._fail)
+            self._step_all(episodes, actions, self._fail)
             return episodes
         places = [place for place, is_over in enumerate(ended) if not is_over]
-        step_all(
+        self._step_all(
             [episodes[place] for place in places],
             [actions[place] for place in places],
             lambda index, error: self._fail(places[index], error),
@@ -250,6 +299,21 @@ class SimulationBatch:
             session.abandon()
 
 
+def _step_in_time(limit: float, *arguments: Any) -> None:
+    """Step many episodes, or raise a ``StepTimeoutError``."""
+    with StepAlarm(limit):
+        step_all(*arguments)
+
+
+def _step_or_exit(seconds: float, step: Callable[..., None], *arguments: Any) -> None:
+    """Step many episodes. After some seconds, print the stack and end the process."""
+    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
+    try:
+        step(*arguments)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
 def make_batch(
     simulation: Model,
     points: Points,
@@ -257,4 +321,8 @@ def make_batch(
     *arguments: Any,
 ) -> SimulationBatch:
     """Make a batch in a worker. ``arguments``: the ones of ``SimulationBatch`` after the plan."""
-    return SimulationBatch(plan_of(simulation, points, options), *arguments)
+    batch = SimulationBatch(plan_of(simulation, points, options), *arguments)
+    limit = options.get("step_timeout")
+    if limit is not None:
+        batch.exit_after(limit + 1.2 * SECONDS_TO_UNWIND)
+    return batch

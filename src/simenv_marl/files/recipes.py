@@ -19,7 +19,7 @@ Json = dict[str, Any]
 FORMAT: Final = 1
 """The version of the files."""
 
-_LEFT_OUT: Final = ("plugins", "policies", "record", "record_all")
+_LEFT_OUT: Final = ("plugins", "policies", "record", "record_all", "step_timeout")
 """Options that are no part of a recipe, or have an entry in another form."""
 
 

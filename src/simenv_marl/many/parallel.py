@@ -10,7 +10,9 @@ import multiprocessing
 import os
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from math import ceil, inf
@@ -44,6 +46,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from .alone import run_alone
 
 Result = TypeVar("Result")
 
@@ -203,11 +206,12 @@ def take_load() -> Load | None:
 def spread(
     work: Callable[..., Result],
     arguments: tuple[object, ...],
-    items: Sequence[object],
+    items: Sequence[Any],
     workers: int,
     least: int,
     bar: ProgressBar,
     share: int = 4,
+    lost: Callable[[Any, WorkerError], Result] | None = None,
 ) -> list[Result]:
     """Work on items in this process, or on parts of them in processes of joblib.
 
@@ -219,6 +223,8 @@ def spread(
         least: The smallest number of items in a part, unless a worker would get none.
         bar: The progress bar.
         share: About how many parts each worker gets.
+        lost: Returns the result for an item whose process has died twice. None: the first death is
+            an error. If all of several items are lost, that is an error, too.
 
     Returns:
         The result of each part, in the order of the items.
@@ -230,40 +236,73 @@ def spread(
     processes = max(1, joblib.effective_n_jobs(workers))
     fewest = min(least, ceil(len(items) / processes))
     size = max(1, ceil(len(items) / (share * processes)), fewest)
-    parts = [items[start : start + size] for start in range(0, len(items), size)]
+    waiting = deque(items[start : start + size] for start in range(0, len(items), size))
     parcel = pack((work, arguments))
     backend, _ = joblib.parallel.get_active_backend()
     form = "generator" if backend.supports_return_generator else "list"
     # Outcomes are packed in the worker, because each backend passes errors on in its own way.
-    parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
+    settings = {"batch_size": 1, "return_as": form, "pre_dispatch": "n_jobs"}
     call = joblib.delayed(pack_outcome)
     results: list[Result] = []
+    news: list[WorkerError] = []
     with _shared(bar) as path:
-        load = Load(len(items), processes)
-        outcomes = parallel(
-            call(_work, parcel, os.getpid(), path, load if part is parts[0] else None, part)
-            for part in parts
-        )
-        try:
-            for _, outcome in zip(parts, outcomes, strict=True):
-                returned, error = unpack_outcome(outcome)
-                if error is not None:
-                    raise error
-                result, counts, missing = returned
-                results.append(result)
-                for token, numbers in counts.items():
-                    count(token, **numbers)
-                if missing:
-                    _SharedBar(path).update(missing)
-        finally:
-            if form == "generator":
-                with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
-                    outcomes.close()  # cancels the remaining work
+        task = _work, parcel, os.getpid(), path
+        loads = [Load(len(items), processes)]  # for the first part
+        while waiting:
+            begun: deque[Sequence[Any]] = deque()
+            parallel = joblib.Parallel(n_jobs=workers, **settings)
+            outcomes = parallel(
+                call(*task, part, loads.pop() if loads else None) for part in _moved(waiting, begun)
+            )
+            try:
+                for outcome in outcomes:
+                    results.append(_received(outcome, path))
+                    begun.popleft()
+            except BrokenProcessPool:
+                if lost is None:
+                    raise
+            finally:
+                if form == "generator":
+                    with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
+                        outcomes.close()  # cancels the remaining work
+            again = [item for part in begun for item in part]
+            for item, outcome in zip(again, run_alone(task, again, processes), strict=True):
+                if outcome is not None:
+                    results.append(_received(outcome, path))
+                elif lost is not None:
+                    news.append(WorkerError(f"the process of {item!r} has died twice"))
+                    results.append(lost(item, news[-1]))
+    if 1 < len(items) == len(news):
+        raise news[0]
     return results
 
 
+def _moved(waiting: deque[Result], begun: deque[Result]) -> Iterator[Result]:
+    """Yield items of a queue, each when it has moved to another."""
+    while waiting:
+        begun.append(waiting.popleft())
+        yield begun[-1]
+
+
+def _received(outcome: bytes, path: str) -> Any:
+    """Return the result of ``_work``, or raise its error. ``path`` is for a ``_SharedBar``."""
+    returned, error = unpack_outcome(outcome)
+    if error is not None:
+        raise error
+    result, counts, missing = returned
+    for token, numbers in counts.items():
+        count(token, **numbers)
+    if missing:
+        _SharedBar(path).update(missing)
+    return result
+
+
 def _work(
-    parcel: bytes, home: int, path: str, load: Load | None, items: Sequence[object]
+    parcel: bytes,
+    home: int,
+    path: str,
+    items: Sequence[object],
+    load: Load | None = None,
 ) -> tuple[object, dict[str, dict[str, float]], int]:
     """Work on a part of the items, in a worker. ``path`` is for its ``_SharedBar``.
 
@@ -281,6 +320,9 @@ def _work(
 
 
 # -- processes of a pool --------------------------------------------------------------------------
+
+Outcomes = dict[int, tuple[Any, BaseException | None]]
+"""By the number of a worker, its result, or None and its error."""
 
 SECONDS_TO_CLOSE: Final = 10.0
 """The seconds that a worker may take to close its object and to end."""
@@ -310,16 +352,22 @@ def _serve(connection: Connection, other_end: Connection | None, recipe: bytes) 
             each.abandon()
 
 
-def _call(served: list[Any], method: str, *args: object) -> Any:
+def call(served: list[Any], method: str, *args: object) -> Any:
     """In a worker, call a method of its object."""
     return getattr(served[0], method)(*args)
 
 
-class _Worker(Peer):
-    """A process with a part of the simulations."""
+class Worker(Peer):
+    """A process with a part of the simulations.
+
+    Attributes:
+        name: Its number, and the numbers of its simulations.
+        gone: How it has died. Empty while it lives.
+    """
 
     def __init__(self, context: Any, number: int, part: range, recipe: bytes) -> None:
         """Start the process."""
+        self.gone = ""
         self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
         connection, theirs = context.Pipe()
         super().__init__(connection)
@@ -342,14 +390,16 @@ class _Worker(Peer):
         self._process.join(1.0)  # its connection closes a moment before it ends
         code = self._process.exitcode
         how = "closed its pipe" if code is None else f"died with exit code {code}"
+        self.gone = f"{self.name} {how}"
         hint = ""
         if code == 1:  # an error has ended it before it could send a message
             hint = (
                 '. In a script, make environments with workers under `if __name__ == "__main__":`,'
-                " because each worker imports the script"
+                " because each worker imports the script. With step_timeout=, C code may have taken"
+                " too long; then its stack is in stderr"
             )
         return WorkerError(
-            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts"
+            f"{self.gone}; it was killed, or a simulation ended the process. reset() starts"
             f" new workers{hint}"
         )
 
@@ -373,7 +423,10 @@ class WorkerPool:
     Attributes:
         failed: Whether an error has left the simulations at different steps, so that all of them
             need a reset.
+        restarts: The number of workers that were replaced after their death.
     """
+
+    restarts = 0
 
     def __init__(
         self,
@@ -417,7 +470,7 @@ class WorkerPool:
             ) from error
         self._context = context
         self._home = os.getpid()
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
         self._is_broken = True  # a worker is dead, or owes an answer because of an interrupt
         self.failed = False
         self._start()
@@ -431,35 +484,53 @@ class WorkerPool:
         """Start all workers, and have them make their objects."""
         try:
             for number, part in enumerate(self._parts):
-                self._workers.append(_Worker(self._context, number, part, self._recipes[number]))
-            self._exchange([])
+                self._workers.append(Worker(self._context, number, part, self._recipes[number]))
+            self._results(self._exchange(dict.fromkeys(range(len(self._parts)), b"")))
         except BaseException:
             self.abandon()
             raise
         self._is_broken = False
 
-    def _exchange(self, requests: Iterable[bytes], seconds: float = inf) -> list[Any]:
-        """Send each worker its request, if there are any. Return the results of the responses.
+    def _exchange(self, requests: Mapping[int, bytes], seconds: float = inf) -> Outcomes:
+        """Send workers, given by number, their requests, if these are not empty.
+
+        Return the result or the error of each. If one has died, the pool is broken.
 
         Raises:
             TimeoutError: Not all of them came within some seconds. The pool is broken.
-            WorkerError: A worker has died. The pool is broken.
-            BaseException: The first error of an object.
         """
         deadline = monotonic() + seconds
+        outcomes: Outcomes = {}
         try:
-            for worker, request in zip(self._workers, requests, strict=False):
-                worker.send(request)
-            responses = [worker.receive(deadline - monotonic()) for worker in self._workers]
+            for number, request in requests.items():
+                with suppress(WorkerError):  # ``receive`` raises it again
+                    if request:
+                        self._workers[number].send(request)
+            for number in requests:
+                try:
+                    response = self._workers[number].receive(deadline - monotonic())
+                except WorkerError as error:
+                    self._break()
+                    outcomes[number] = None, error
+                else:
+                    outcomes[number] = unpack_outcome(response)
         except BaseException:
-            self._is_broken = True
-            self.failed = True
+            self._break()
             raise
+        return outcomes
+
+    def _break(self) -> None:
+        """Note that the workers cannot go on until a reset."""
+        self._is_broken = True
+        self.failed = True
+
+    def _results(self, outcomes: Outcomes) -> list[Any]:
+        """Return the results in the order of the workers, or raise the first error."""
         results = []
-        for worker, response in zip(self._workers, responses, strict=True):
-            result, error = unpack_outcome(response)
+        for number, (result, error) in sorted(outcomes.items()):
             if error is not None:
-                annotate(error, f"simenv_marl: in {worker.name}")
+                if not self._workers[number].gone:
+                    annotate(error, f"simenv_marl: in {self._workers[number].name}")
                 raise error
             results.append(result)
         return results
@@ -491,17 +562,19 @@ class WorkerPool:
             raise WorkerError(
                 "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
             )
-        requests = []
-        for part in self._parts:
-            own = [_share_of(argument, part) for argument in arguments]
-            requests.append(pack_request(_call, method, *own))
+        shares = [[_share_of(argument, part) for argument in arguments] for part in self._parts]
         moves = method in ("reset", "step")
         if moves:
             self.failed = True  # until all simulations have moved
-        results = self._exchange(requests)
+        results = self._ask_all(method, shares)
         if moves:
             self.failed = False
         return results
+
+    def _ask_all(self, method: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
+        """Call a method of each worker's object, with a share of the arguments for each."""
+        requests = [pack_request(call, method, *share) for share in shares]
+        return self._results(self._exchange(dict(enumerate(requests))))
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds.
@@ -511,8 +584,8 @@ class WorkerPool:
         """
         try:
             if not self._is_broken and os.getpid() == self._home:
-                requests = [pack_request(_call, "close")] * len(self._workers)
-                self._exchange(requests, SECONDS_TO_CLOSE)
+                requests = dict.fromkeys(range(len(self._workers)), pack_request(call, "close"))
+                self._results(self._exchange(requests, SECONDS_TO_CLOSE))
         except (WorkerError, TimeoutError) as error:
             if not self._is_broken:
                 raise

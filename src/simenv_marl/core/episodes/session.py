@@ -53,6 +53,20 @@ MOST_SEEDS: Final = 100
 """How many seeds a reset tries until the one agent of a single view decides."""
 
 
+class LimitedEpisode(Episode):
+    """An episode whose steps have a time limit."""
+
+    __slots__ = ()
+
+    def step(self, action: Action, entered: bool = False) -> None:
+        """Take a step, or raise a ``StepTimeoutError``."""
+        if entered:
+            super().step(action, entered)
+            return
+        with self.driver.limit(self.plan.options.step_timeout or 0.0):
+            super().step(action)
+
+
 class Session(BaseSession):
     """A session whose simulation is in this process.
 
@@ -273,7 +287,12 @@ class Session(BaseSession):
         simulation = self._simulation
         self._reset(seed=seed, options=self.options)
         self._close = self._closer
-        self.episode = episode = Episode(
+        kind = Episode
+        limit = self.plan.options.step_timeout
+        if limit is not None:
+            self._driver.limit(limit)  # or an error here
+            kind = LimitedEpisode
+        self.episode = episode = kind(
             self, simulation, self._driver, seed, replay, in_rounds=in_rounds
         )
         return simulation.run, self.handlers.with_agents(episode.agents.values())

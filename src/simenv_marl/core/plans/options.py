@@ -10,7 +10,7 @@ from itertools import chain
 from math import inf
 from os import PathLike
 from textwrap import indent
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, Final, Literal, TypedDict, TypeVar
 
 from gymnasium.spaces import Space
 
@@ -61,6 +61,7 @@ class CheckOptions(_CommonOptions, total=False):
     policies: Mapping[Any, Any] | None
     record: str | PathLike[str] | None
     record_all: bool
+    step_timeout: float | None
 
 
 class ViewOptions(EpisodeOptions, CheckOptions, total=False):
@@ -142,12 +143,24 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         _is_bool,
         "True or False",
     ),
+    "step_timeout": (
+        lambda seconds: is_number(seconds) and 0 < float(seconds) < inf,
+        "a positive number of seconds or None",
+    ),
     "plugins": (
         _is_list,
         "a list of (handler, target, position)",
     ),
 }
 """The check of each option's value, unless it is the default, and the valid values in words."""
+
+
+NOT_OF_RUNS: Final = {
+    "agent": "single views",
+    "record": "environments",
+    "step_timeout": "environments",
+}
+"""The options that functions that run whole episodes refuse, and whose they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +208,9 @@ class Options:
         record: A folder, in which each episode is written to a file while it runs. The file stays
             if an error or a kill ends the episode. ``load_episode`` loads it. None: no files.
         record_all: Whether the files of all episodes stay.
+        step_timeout: The largest number of seconds that a step may take. After it, ``step`` raises
+            a ``StepTimeoutError``, which shows where the model was, and the episode ends. Resets
+            have no limit. With greenlets, only in the main thread. None: no limit.
     """
 
     driver: str = "greenlet"
@@ -215,6 +231,7 @@ class Options:
     render_mode: str | None = None
     record: str | PathLike[str] | None = None
     record_all: bool = False
+    step_timeout: float | None = None
 
     def __post_init__(self) -> None:
         for name, (is_valid, expected) in _VALID.items():

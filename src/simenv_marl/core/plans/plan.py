@@ -42,7 +42,7 @@ from ...simulation import (
 from ..switching.driver import Driver
 from ..switching.greenlets import GreenletDriver
 from ..switching.threads import ThreadDriver
-from .options import Options
+from .options import NOT_OF_RUNS, Options
 from .point import Point, Policy
 from .points import (
     Definitions,
@@ -391,7 +391,7 @@ def make_plan(
         source, points, options = variant.environment_arguments(points, options)
     checked = Options().amended(options)
     has_user = mode is Mode.ENVIRONMENT
-    for name, views in () if has_user else (("agent", "single views"), ("record", "environments")):
+    for name, views in () if has_user else NOT_OF_RUNS.items():
         if getattr(checked, name) is not None:
             raise UnknownOptionError(
                 f"{name} is an option of {views} only, as single_env makes them"

@@ -15,6 +15,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from asyncio import _get_running_loop as running_loop
 from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import AbstractContextManager
 from contextvars import Context, copy_context
 from functools import partial
 from sys import exception, modules
@@ -27,6 +28,7 @@ from greenlet import getcurrent, greenlet
 
 from ...errors import SimulationError, WrongThreadError, annotate, warn_user
 from ...hooks.hook import BOUND, Hook
+from ...hooks.limits import SECONDS_TO_UNWIND
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Function, Model, Sentinel
@@ -36,9 +38,6 @@ from .opened import Resource, watch_resources
 
 WAIT: Final = Sentinel("WAIT")
 """What ``handle`` returns instead of a reply if the episode waits for an action, or is over."""
-
-SECONDS_TO_UNWIND: Final = 5.0
-"""How long a simulation in a thread may take to its next decision or its end while it unwinds."""
 
 UNWINDING_TRIES: Final = 1000
 """How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
@@ -226,6 +225,10 @@ class Driver(ABC):
     @abstractmethod
     def end(self) -> None:
         """End the stack."""
+
+    @abstractmethod
+    def limit(self, seconds: float) -> AbstractContextManager[None]:
+        """Return a context that raises a ``StepTimeoutError`` after some seconds."""
 
     def begin(self, prepare: Callable[[], Job]) -> None:
         """Prepare a job. After ``enter``, the next ``resume`` starts it on the stack.

@@ -10,17 +10,29 @@ from contextvars import Context
 from functools import cache
 from platform import machine
 from sys import modules, platform
-from typing import Final
+from typing import Final, NoReturn
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
-from ...errors import WrongThreadError, warn_user
+from ...errors import StepTimeoutError, WrongThreadError, warn_user
+from ...hooks.hook import BOUND
+from ...hooks.limits import StepAlarm
 from ...hooks.locks import watch_locks
-from ...hooks.stacks import STACKS
+from ...hooks.stacks import STACKS, Args, Kwargs
 from ...simulation import Model
-from .driver import ENDED, THREAD, Driver, Event
+from .driver import ENDED, THREAD, Driver, Event, Observer, Receiver
 from .exits import SimulationExit
 from .loops import NO_LOOP, swap_loop
+
+
+class _Late(Observer):
+    """Raises the error of a step whose time is over."""
+
+    def __init__(self, error: StepTimeoutError) -> None:
+        self._error = error
+
+    def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> NoReturn:
+        raise self._error
 
 
 class GreenletDriver(Driver):
@@ -54,10 +66,14 @@ class GreenletDriver(Driver):
         # Inside another environment's simulation each step needs ``enter``, to hide that one.
         self.caller = here if direct and here not in STACKS else None
 
-    def throw(self) -> Event:
+    def limit(self, seconds: float) -> StepAlarm:
+        """Return a context that ends a step by a signal."""
+        return StepAlarm(seconds)
+
+    def throw(self) -> Event | None:
         """Raise ``SimulationExit`` in the suspended simulation; return its next event."""
         suspended: greenlet = self.resume.__self__  # type: ignore[attr-defined]
-        event: Event = suspended.throw(SimulationExit())
+        event: Event | None = suspended.throw(SimulationExit())
         return event
 
     def end(self) -> None:
@@ -76,6 +92,20 @@ class GreenletDriver(Driver):
             stack.throw()
 
     # -- on the simulation's side -----------------------------------------------------------------
+
+    def interrupt(self, error: StepTimeoutError, again: bool) -> None:
+        """Let the simulation wait wherever it is, and raise an error on the user's side.
+
+        Then it unwinds. If it still does so when it is interrupted ``again``, it is given up.
+        """
+        if self._exiting:
+            if again:
+                self._leave(None)
+            return
+        if not self.events:  # it is reset or closed
+            raise error
+        hook = next(iter(self.events))  # which one makes no difference
+        self._decider(hook, hook.rule, _Late(error), None, away=True)((), BOUND)
 
     def _serve(self) -> None:
         try:

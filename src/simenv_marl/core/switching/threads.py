@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from contextvars import Context
 from queue import Empty, SimpleQueue
 from sys import _current_frames
 from threading import Thread
+from time import monotonic
 from types import FrameType
 from typing import Final
 
 from greenlet import greenlet
 
 from ...errors import SimulationError, WrongThreadError
+from ...hooks.limits import SECONDS_TO_UNWIND, step_timeout_error
 from ...hooks.locks import LOOKS, explain_wait
 from ...hooks.stacks import SIMULATION
 from ...simulation import Model, Sentinel
-from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event
-from .exits import SimulationExit
+from .driver import ENDED, Driver, Event
+from .exits import LoopExit, SimulationExit
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds, because Ctrl-C may come before it."""
+
+_raise_in: Final = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)(
+    ("PyThreadState_SetAsyncExc", ctypes.pythonapi)
+)
+"""Raises an error, given by the address of its class, in a thread. None: not any more."""
 
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
@@ -35,7 +44,7 @@ class ThreadDriver(Driver):
     ignored, and each job has a queue of events. ``caller`` is always None.
     """
 
-    __slots__ = ("_arrived", "_replies")
+    __slots__ = ("_arrived", "_limit", "_replies")
 
     _shares_thread = False
 
@@ -43,6 +52,7 @@ class ThreadDriver(Driver):
 
     def _make_stack(self) -> None:
         self._arrived: SimpleQueue[Event] = SimpleQueue()
+        self._limit: tuple[float, float] | None = None  # the end of the step, and its seconds
         if self._thread is not None:
             with suppress(Empty):
                 while True:
@@ -68,9 +78,15 @@ class ThreadDriver(Driver):
         """Resume the simulation with a reply; return its next event."""
         self._replies.put(reply if self._prepare is None else _JOB)
         looks = 0
+        wait = _LONGEST_WAIT
         while True:
+            if self._limit is not None:
+                end, seconds = self._limit
+                wait = min(_LONGEST_WAIT, end - monotonic())
+                if wait <= 0:
+                    raise step_timeout_error(seconds, self._innermost())
             with suppress(Empty):
-                return self._arrived.get(True, _LONGEST_WAIT)
+                return self._arrived.get(True, wait)
             looks += 1
             running = self._innermost()
             if looks % LOOKS == 0 and running is not None:
@@ -78,6 +94,15 @@ class ThreadDriver(Driver):
                     self._deadlock = explain_wait(running, self.user)
                 if self._deadlock is not None:
                     raise SimulationError(self._deadlock)
+
+    @contextmanager
+    def limit(self, seconds: float) -> Iterator[None]:
+        """Return a context that ends the wait for the simulation."""
+        self._limit = monotonic() + seconds, seconds
+        try:
+            yield
+        finally:
+            self._limit = None
 
     def _innermost(self) -> FrameType | None:
         return _current_frames().get(getattr(self._thread, "ident", 0))
@@ -94,10 +119,17 @@ class ThreadDriver(Driver):
         Return its next event.
         """
         self._replies.put(_EXIT)
+        late = 0
+        if self._limit is not None and monotonic() > self._limit[0] and self.frame is None:
+            late = getattr(self._thread, "ident", 0)  # it may be in a loop, without decisions
+            _raise_in(late, id(LoopExit))
         try:
-            return self._arrived.get(self._deadlock is None, SECONDS_TO_UNWIND)
+            event = self._arrived.get(self._deadlock is None, SECONDS_TO_UNWIND)
         except Empty:
             return None
+        if late:
+            _raise_in(late, None)
+        return event
 
     def end(self) -> None:
         """End the stack, and join its thread. After an interrupt this can be called again.
@@ -125,10 +157,14 @@ class ThreadDriver(Driver):
             self._arrived.put(ENDED)
             return
         try:
-            while not self.ended and (reply := self._replies.get()) is not _END:
-                if reply is _JOB:
-                    self._do()
-                reply = None
+            while not self.ended:
+                with suppress(SimulationExit):  # that came after the end of its job
+                    reply = self._replies.get()
+                    if reply is _END:
+                        break
+                    if reply is _JOB:
+                        self._do()
+                    reply = None
         finally:
             self._forget_stack()
 

@@ -1,4 +1,4 @@
-"""A growing list of policies, of which one decides in each episode."""
+"""A growing list of policies: another one decides in each episode."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class OpponentPool(EpisodePolicy):
             policies: Functions, or ``RULE``. They answer at once; besides an observation and an
                 info they may ask for ``_decision`` and ``_simulation``.
             weights: How often each is drawn, relative to the others. None: equally often.
-            seed: Distinguishes the draws from those of another pool. None: 0.
+            seed: Another seed draws other policies. None: 0.
 
         Raises:
             OptionValueError: An argument is invalid.
@@ -69,7 +69,7 @@ class OpponentPool(EpisodePolicy):
             self.add(policy, weight)
 
     def add(self, policy: Policy, weight: float = 1.0) -> None:
-        """Add a policy. Episodes in which the pool has answered keep theirs.
+        """Add a policy. An episode keeps the policy that the pool has drawn for it.
 
         Args:
             policy: The policy.

@@ -44,7 +44,7 @@ def _space(name: str, place: int, args: Sequence[Any], kwargs: dict[str, Any]) -
 
 
 class TimedReplayBuffer(buffers.ReplayBuffer):
-    """A replay buffer whose samples have the discounts of their own intervals.
+    """A replay buffer whose samples have the discounts of their intervals.
 
     Pass it as ``replay_buffer_class=`` to ``DQN``, ``SAC`` or ``TD3``, which do not use ``gamma``
     then. It serves several environments, and observations of a ``Dict``.
@@ -94,7 +94,7 @@ class TimedReplayBuffer(buffers.ReplayBuffer):
 
 
 class TimedRolloutBuffer(buffers.RolloutBuffer):
-    """A rollout buffer whose returns and advantages have the discounts of their own intervals.
+    """A rollout buffer whose returns and advantages have the discounts of their intervals.
 
     Pass it as ``rollout_buffer_class=`` to ``PPO``, ``A2C`` or ``MaskablePPO``, which do not use
     ``gamma`` then. It serves several environments, observations of a ``Dict``, and masks.
@@ -143,7 +143,7 @@ class TimedRolloutBuffer(buffers.RolloutBuffer):
         super().add(obs, action, reward, *others, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: Any, dones: Any) -> None:
-        """Estimate advantages (GAE), in which each step has its own discount."""
+        """Estimate advantages (GAE), with a discount for each step."""
         values = np.vstack([self.values, last_values.cpu().numpy().reshape(1, -1)])
         weights = self.discounts * (1 - np.vstack([self.episode_starts[1:], dones]))
         advantage = 0.0

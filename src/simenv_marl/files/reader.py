@@ -14,7 +14,7 @@ from .values import encode_value
 
 @dataclass
 class EpisodeLines:
-    """An episode of a file. In that of a game, decisions can be undone.
+    """An episode of a file. A game can have decisions that were undone.
 
     Attributes:
         head: The first line.
@@ -29,7 +29,7 @@ class EpisodeLines:
 
     @property
     def decisions(self) -> list[Json]:
-        """The lines of the decisions, also of those that were undone, with what a game notes."""
+        """The lines of the decisions, undone ones included, with the notes of a game."""
         lines = [self.lines[place][1] for place in self._places]
         return [{**line, **line.get("play", {})} for line in lines]
 

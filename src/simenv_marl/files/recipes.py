@@ -99,7 +99,7 @@ def recipe_of(plan: Plan, unnamed: bool = False) -> Json:
     if writer.unnamed and not unnamed:
         places = [f"{place}: {short_repr(thing)}" for place, thing in writer.unnamed.items()]
         raise EpisodeFileError(
-            f"these have no dotted name, by which another process finds them: {listed(places)}. A"
+            f"these have no dotted name for another process to find them: {listed(places)}. A"
             " name is that of a function or class of a module, or of a module's attribute that"
             " holds the object. Put them in a module, or use save_episode(..., unnamed=True), and"
             " give them to load_episode"

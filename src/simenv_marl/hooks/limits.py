@@ -26,7 +26,7 @@ def step_timeout_error(seconds: float, frame: FrameType | None) -> StepTimeoutEr
 
 
 class StepAlarm:
-    """A context in which a step ends by an error when its time is over.
+    """A context that ends a step by an error when its time is over.
 
     It borrows the timer and the handler of SIGALRM. The user's own alarms still ring meanwhile.
     """

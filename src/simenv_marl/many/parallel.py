@@ -21,7 +21,7 @@ from multiprocessing.context import BaseContext
 from tempfile import mkstemp
 from threading import Event, Thread
 from time import monotonic
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ from ..errors import (
     warn_user,
 )
 from .alone import run_alone
+from .loads import Load, loaded
 
 Result = TypeVar("Result")
 
@@ -171,35 +172,6 @@ def _shared(bar: ProgressBar) -> Iterator[str]:
         os.remove(path)
 
 
-# -- what a run has before it ----------------------------------------------------------------------
-
-
-class Load(NamedTuple):
-    """The episodes of a run, and the processes that share them."""
-
-    episodes: int
-    processes: int
-
-
-_LOADS: Final[list[Load]] = []
-
-
-@contextmanager
-def _loaded(episodes: int, processes: int) -> Iterator[None]:
-    """Let the first planner of a run take its load."""
-    before = [*_LOADS]
-    _LOADS.append(Load(episodes, processes))
-    try:
-        yield
-    finally:
-        _LOADS[:] = before
-
-
-def take_load() -> Load | None:
-    """Return the load of the run, once. None outside of runs."""
-    return _LOADS.pop() if _LOADS else None
-
-
 # -- processes of joblib --------------------------------------------------------------------------
 
 
@@ -230,7 +202,7 @@ def spread(
         The result of each part, in the order of the items.
     """
     if not workers or not items:
-        with _loaded(len(items), 1):
+        with loaded(len(items), 1):
             return [work(*arguments, items, bar)]
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
@@ -252,7 +224,7 @@ def spread(
             begun: deque[Sequence[Any]] = deque()
             parallel = joblib.Parallel(n_jobs=workers, **settings)
             outcomes = parallel(
-                call(*task, part, loads.pop() if loads else None) for part in _moved(waiting, begun)
+                call(*task, loads.pop() if loads else None, part) for part in _moved(waiting, begun)
             )
             try:
                 for outcome in outcomes:
@@ -266,7 +238,9 @@ def spread(
                     with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
                         outcomes.close()  # cancels the remaining work
             again = [item for part in begun for item in part]
-            for item, outcome in zip(again, run_alone(task, again, processes), strict=True):
+            for item, outcome in zip(
+                again, run_alone((*task, None), again, processes), strict=True
+            ):
                 if outcome is not None:
                     results.append(_received(outcome, path))
                 elif lost is not None:
@@ -301,8 +275,8 @@ def _work(
     parcel: bytes,
     home: int,
     path: str,
+    load: Load | None,
     items: Sequence[object],
-    load: Load | None = None,
 ) -> tuple[object, dict[str, dict[str, float]], int]:
     """Work on a part of the items, in a worker. ``path`` is for its ``_SharedBar``.
 
@@ -315,7 +289,7 @@ def _work(
         COUNTS.clear()
     work, arguments = unpack(parcel)
     bar = _SharedBar(path) if path else NO_BAR
-    with nullcontext() if load is None else _loaded(*load):
+    with nullcontext() if load is None else loaded(*load):
         return work(*arguments, items, bar), COUNTS if is_away else {}, bar.missing
 
 

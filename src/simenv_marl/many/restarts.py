@@ -12,7 +12,7 @@ from ..errors import StepTimeoutError, WorkerError, warn_user
 from .parallel import Outcomes, Worker, WorkerPool, call
 
 HOUR: Final = 3600.0
-"""The seconds in which deaths are counted."""
+"""The number of seconds over which deaths are counted."""
 
 
 def remake(recipe: bytes, *state: object) -> Any:

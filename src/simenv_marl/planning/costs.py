@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Final, NamedTuple
 
 from ..core import Policy, branch
-from ..many.parallel import take_load
+from ..many.loads import take_load
 from .candidates import Task
 from .player import Environment, Player
 from .players import player_of

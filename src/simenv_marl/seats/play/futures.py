@@ -132,7 +132,7 @@ class Exploration:
 
         Args:
             twin: The clone.
-            own: An agent that first takes actions of its own.
+            own: An agent that first takes given actions.
             held: These actions, as JSON. Policies and the rule answer for illegal ones.
 
         Yields:

@@ -58,7 +58,7 @@ def play(
             same seats and links.
         new: Whether to begin another game in an existing ``record``.
         tools: Who may undo, jump, restart and let the rule play on: "all", "none", or
-            "facilitator", who has a link of its own.
+            "facilitator", who has another link.
         time_unit: The unit of the simulation's time, in the singular, such as "hour".
         host: The address to listen on. Only on one of this machine, all may take free seats.
         port: The port; 0: any free one.

@@ -1,27 +1,45 @@
-"""Calls that decide for many entities at once: each item is a decision."""
+"""Calls that decide for many entities at once, and questions of tasks that wait together."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from asyncio import Task
+from collections import deque
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 from inspect import isgenerator
 from types import coroutine
-from typing import Protocol
+from typing import Any, Protocol
 
-from ...errors import SimulationError
+from ...errors import AgentError, SimulationError
 from ...hooks.hook import BOUND
 from ...hooks.stacks import Interceptor
-from ...simulation import RULE, Model
-from ..plans.point import Args, Kwargs
-from ..switching.driver import Event
+from ...simulation import RULE, Action, Model, Observation
+from ..plans.plan import Plan
+from ..plans.point import Args, Kwargs, Policy
+from ..plans.policies import AskedAgent, AskedEpisode, EpisodePolicy, Info, Where, waits
+from ..switching.awaiting import Answer, Answers
+from ..switching.driver import Driver, Event, Observer
+from ..switching.loops import Question
+from ..values.spaces import duplicate
 from .agent import Agent, DecisionHandler, RunningEpisode
 
 
 class SplittingEpisode(RunningEpisode, Protocol):
     """The episode, as the handlers of calls that are split use it."""
 
-    def begin_split(self, call: SplitCall) -> None:
+    def begin_split(self, call: SplitCall | Gathered) -> None:
         """Decide the items of a call, before the simulation moves."""
+
+    @property
+    def where(self) -> Where:
+        """Where it is played."""
+
+    @property
+    def replay(self) -> deque[Action] | None:
+        """The answers of the episode that it repeats."""
+
+    def answer_by(self, policy: Policy, agent: Agent) -> Model:
+        """Let a policy answer. Return the reply, or the agent if the policy is asked later."""
 
 
 class SplitHandler:
@@ -161,3 +179,129 @@ def _value(value: Model, kind: str) -> Generator[Model, Model, Model]:
     if kind == "function":
         return value
     return (yield from value if isgenerator(value) else value.__await__())
+
+
+# -- tasks that wait ------------------------------------------------------------------------------
+
+
+class _GatheringHandler(Observer):
+    """Handles the questions of tasks that wait together."""
+
+    def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
+        """Have the policies asked at once, and reply to the first question."""
+        (questions,) = args
+        is_asked = episode.where is Where.USER and not episode.replay
+        if is_asked and not questions[0].deferred:
+            answers = Answers()
+            try:
+                for question in questions:
+                    episode.blame(question.agent)
+                    answers.add(question, question.begin())
+                while answers:
+                    question, answer = answers.take()
+                    question.note(answer)
+            finally:
+                answers.cancel()
+        call = Gathered(questions)
+        episode.begin_split(call)
+        return call.question.handle(episode, (), BOUND)
+
+
+class TaskQuestion(EpisodePolicy, Question, Observer):
+    """The question of a task to a policy that waits. It takes the policy's place, once answered.
+
+    Attributes:
+        agent: The agent that decides.
+        task: The task.
+        begin: Asks the policy.
+    """
+
+    handler = _GatheringHandler()
+
+    def __init__(
+        self, policy: EpisodePolicy, episode: AskedEpisode, agent: Agent, task: Task[Model]
+    ) -> None:
+        self.policy: Any = policy
+        self.agent = agent
+        self.task = task
+        self.deferred = policy.deferred
+        observation = duplicate(agent.raw_observation)
+        self.begin = policy.prepare(episode, agent, observation, agent.info)
+        self._answer: Answer | None = None
+
+    def note(self, answer: Answer) -> None:
+        """Note the answer, which has come."""
+        self._answer = answer
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the answer has come."""
+        return self._answer is not None
+
+    def result(self) -> Action:
+        """Return the answer, or raise the error of the policy."""
+        return None if self._answer is None else self._answer.result()
+
+    def answer(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Return the answer. If the policy was not asked, let it or its substitute answer now."""
+        if self._answer is None:
+            return self.policy.answer(episode, agent, observation, info)
+        return self._answer.result()
+
+    def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
+        """Reply to the question."""
+        return episode.answer_by(self, self.agent)
+
+
+def question_of(
+    episode: AskedEpisode, driver: Driver, agent: Agent, policy: Policy
+) -> TaskQuestion | None:
+    """Make the question for which a task of the model waits. None where none can wait.
+
+    Raises:
+        AgentError: Another task waits for an answer of the same agent.
+    """
+    if not (isinstance(policy, EpisodePolicy) and policy.waits):
+        return None
+    tasks = driver.tasks
+    task = tasks.current(driver.loop)
+    if task is None or agent.point.hook.kind != "coroutine":
+        return None
+    for other in tasks.questions(driver.loop):
+        if other.agent is agent:
+            raise AgentError(
+                f"the agent {agent.name!r} decides in two tasks that wait,"
+                f" {other.task.get_name()} and {task.get_name()}; let agent= name each"
+                " differently, or one task wait for the other"
+            )
+    return TaskQuestion(policy, episode, agent, task)
+
+
+def has_waiting(plan: Plan) -> bool:
+    """Return whether a policy of a plan waits."""
+    return any(map(waits, (plan.options.policies or {}).values()))
+
+
+class Gathered:
+    """Questions that are answered one after the other, as the items of a call are."""
+
+    def __init__(self, questions: Iterable[TaskQuestion]) -> None:
+        self.questions = deque(questions)
+        self._replies: list[Model] = []
+
+    @property
+    def question(self) -> TaskQuestion:
+        """The first question without a reply."""
+        return self.questions[0]
+
+    def next_event(self, reply: Model, agent: Agent | None) -> Event | None:
+        """Note the reply to a question; return the event of the next one, or None at the end."""
+        self._replies.append(reply)
+        self.questions.popleft()
+        return (self.question, (), BOUND) if self.questions else None
+
+    def reply(self) -> Model:
+        """Return the replies."""
+        return self._replies

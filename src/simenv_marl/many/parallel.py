@@ -54,6 +54,7 @@ EXTRAS: Final = {
     "pyDOE": "design",
     "SALib": "design",
     "openai": "language",
+    "openenv": "openenv",
     "starlette": "play",
     "uvicorn": "play",
     "websockets": "play",

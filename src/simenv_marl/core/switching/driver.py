@@ -545,7 +545,7 @@ class Driver(ABC):
         """Refuse a decision. The user gets the error at the simulation's next event."""
         error = WrongThreadError(
             f"{hook.name} was called in {where}, where the environment cannot ask for a decision."
-            " Call it where run() runs, and pass the decision on"
+            " Call it where run() runs, as executors that run in turn do, or pass the decision on"
         )
         if self._refused is None and not self.forked:
             self._refused = error

@@ -105,7 +105,7 @@ def test_a_seat_says_and_takes_what_the_environment_does():
     answer = kind.action_class
     env, own = painting(), kind()
     env.reset(seed=4)
-    seen = own.reset(seed=4, episode_id="one", other=3)
+    seen = own.reset(seed=4, episode_id="one")
     assert (seen.prompt, seen.decision) == (describe(env), describe(env, as_json=True))
     assert (seen.reward, seen.done, seen.error) == (None, False, None)
     labels = seen.decision["actions"]["enum"]

@@ -142,11 +142,10 @@ class PolicyKey(DeferredPolicy):
             self.plans = policy.plans
             self.asks = policy.asks
 
-    def prepare(self, *arguments: Any) -> Callable[[], Action]:
-        """Collect the arguments of a policy that waits. Return a function that asks it, later."""
-        policy: Any = self.batch_policy.policy
-        ask: Callable[[], Action] = policy.prepare(*arguments)
-        return ask
+    @property
+    def prepare(self) -> Any:
+        """Collects the arguments of a policy that waits."""
+        return getattr(self.batch_policy.policy, "prepare", None)
 
     def answer(
         self,
@@ -389,9 +388,9 @@ class BatchRun:
             (place, episode, question), answer = self._awaited.take()
             if question is not None:
                 question.note(answer)
-                if not all(each.is_answered for each in episode.questions):
+                if not all(each.answered for each in episode.questions):
                     return
-                answer = episode.questions[0]
+                answer = episode.questions[0].answered
             self._asking.remove(place)
             self._step(place, episode, answer.result)
             self._queue(place, episode)
@@ -405,8 +404,8 @@ class BatchRun:
                 self._end(place, episode)
                 return
             agent, key = _pending(episode)
-            if episode.questions and episode.questions[0].is_answered:
-                self._step(place, episode, episode.questions[0].result)
+            if episode.questions and episode.questions[0].answered:
+                self._step(place, episode, episode.questions[0].answered.result)
                 continue
             if not key.batch_policy.alone:
                 group = key.batch_policy.group(agent.point)

@@ -24,72 +24,58 @@ class _Seat:
 
     SUPPORTS_CONCURRENT_SESSIONS = True
     make: Callable[[], Any]
-    action_class: Any
     observation_class: Any
     state_class: Any
+    _env: Any = None
 
     def __init__(self) -> None:
         super().__init__()
-        self._env: Any = None
         self._decision: dict[str, Any] = {}  # the pending decision, in words and as data
         self.state = self.state_class()
 
     def reset(
-        self,
-        seed: int | None = None,
-        episode_id: str | None = None,
-        *,
-        options: dict[str, Any] | None = None,
-        **others: object,
+        self, seed: int | None = None, episode_id: str | None = None, options: Any = None
     ) -> Any:
-        """Begin an episode, as ``env.reset`` does. Other arguments are ignored."""
-        if self._env is None:
-            self._env = self.make()
+        """Begin an episode, as ``env.reset`` does."""
+        self._env = self._env or self.make()
         self._env.reset(seed=seed, options=options)
         self.state = self.state_class(episode_id=episode_id)
-        return self._observe()
+        return self._observe(None)
 
-    def step(self, action: Any, timeout_s: float | None = None, **others: object) -> Any:
+    def step(self, action: Any) -> Any:
         """Answer the pending decision. After an illegal answer, it is still pending."""
+        self._env = self._env or self.make()
         said = action.action
         text = said if isinstance(said, str) else json.dumps({"action": said})
-        if self._env is None:
-            self._env = self.make()
         try:
             parsed = parse(self._env, text)
         except InvalidActionError as error:
             return self.observation_class(**self._decision, error=str(error), reward=0.0)
-        _, reward, terminated, truncated, _ = self._env.step(parsed)
+        _, reward, *ends, _ = self._env.step(parsed)
         self.state = self.state.model_copy(update={"step_count": self.state.step_count + 1})
-        if terminated or truncated:
+        if any(ends):
             return self.observation_class(reward=reward, done=True)
-        return self._observe(reward=reward)
+        return self._observe(reward)
 
-    def _observe(self, **results: float) -> Any:
+    def _observe(self, reward: float | None) -> Any:
         self._decision = at_decision(self._env, "seat", _in_words)
-        return self.observation_class(**self._decision, **results)
+        return self.observation_class(**self._decision, reward=reward)
 
     def web_actions(self, observation: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
         """Return the labels of the legal actions, and the actions."""
-        actions = (observation["decision"] or {}).get("actions", {})
-        return [(label, {"action": label}) for label in actions.get("enum", ())]
+        labels = observation["decision"]["actions"].get("enum", ())
+        return [(label, {"action": label}) for label in labels]
 
     def close(self) -> None:
         """Close the simulation."""
-        env, self._env = self._env, None
-        if env is not None:
-            with suppress(WrongThreadError):  # a request without a session; its thread unwinds it
+        with suppress(WrongThreadError):  # a request without a session; its thread unwinds it
+            env, self._env = self._env, None
+            if env is not None:
                 env.close()
 
 
 def _in_words(decision: Decision) -> dict[str, Any]:
     return {"prompt": describe(decision), "decision": describe(decision, as_json=True)}
-
-
-def _subclass(base: Any, doc: str, defaults: Any = None, **fields: object) -> Any:
-    """Make a class of messages with further fields."""
-    parts = {"__doc__": doc, "__module__": __name__, "__annotations__": fields, **(defaults or {})}
-    return type(f"Seat{base.__name__}", (base,), parts)
 
 
 def seat(make: Callable[[], Any], *, name: str | None = None) -> Any:
@@ -111,21 +97,24 @@ def seat(make: Callable[[], Any], *, name: str | None = None) -> Any:
         MissingExtraError: The extra is missing.
     """
     server = import_extra("openenv.core.env_server", "seat")
-
+    action = {
+        "__doc__": "The label or the value of a legal action.",
+        "__module__": __name__,
+        "__annotations__": {"action": Any},
+    }
+    observation = {
+        "__doc__": "A pending decision, or the end of an episode.",
+        "__module__": __name__,
+        "__annotations__": {"prompt": str, "decision": dict[str, Any] | None, "error": str | None},
+        "prompt": "",
+        "decision": None,
+        "error": None,
+    }
     parts = {
         "__doc__": f"A seat in the simulation {name}.",
         "make": staticmethod(make),
-        "action_class": _subclass(
-            server.Action, "The label or the value of an action.", action=Any
-        ),
-        "observation_class": _subclass(
-            server.Observation,
-            "A pending decision, or the end of an episode.",
-            {"prompt": "", "decision": None, "error": None},
-            prompt=str,
-            decision=dict[str, Any] | None,
-            error=str | None,
-        ),
+        "action_class": type("SeatAction", (server.Action,), action),
+        "observation_class": type("SeatObservation", (server.Observation,), observation),
         "state_class": server.State,
         "state": None,
     }

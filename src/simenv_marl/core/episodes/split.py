@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 from inspect import isgenerator
 from types import coroutine
-from typing import Any, Protocol
+from typing import Protocol
 
 from ...errors import AgentError, SimulationError
 from ...hooks.hook import BOUND
@@ -27,19 +27,8 @@ from .agent import Agent, DecisionHandler, RunningEpisode
 class SplittingEpisode(RunningEpisode, Protocol):
     """The episode, as the handlers of calls that are split use it."""
 
-    def begin_split(self, call: SplitCall | Gathered) -> None:
+    def begin_split(self, call: SplitCall) -> None:
         """Decide the items of a call, before the simulation moves."""
-
-    @property
-    def where(self) -> Where:
-        """Where it is played."""
-
-    @property
-    def replay(self) -> deque[Action] | None:
-        """The answers of the episode that it repeats."""
-
-    def answer_by(self, policy: Policy, agent: Agent) -> Model:
-        """Let a policy answer. Return the reply, or the agent if the policy is asked later."""
 
 
 class SplitHandler:
@@ -187,7 +176,7 @@ def _value(value: Model, kind: str) -> Generator[Model, Model, Model]:
 class _GatheringHandler(Observer):
     """Handles the questions of tasks that wait together."""
 
-    def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: Model, args: Args, kwargs: Kwargs) -> Model:
         """Have the policies asked at once, and reply to the first question."""
         (questions,) = args
         is_asked = episode.where is Where.USER and not episode.replay
@@ -202,9 +191,8 @@ class _GatheringHandler(Observer):
                     question.note(answer)
             finally:
                 answers.cancel()
-        call = Gathered(questions)
-        episode.begin_split(call)
-        return call.question.handle(episode, (), BOUND)
+        episode.begin_split(Gathered(questions))
+        return questions[0].handle(episode, (), BOUND)
 
 
 class TaskQuestion(EpisodePolicy, Question, Observer):
@@ -214,49 +202,39 @@ class TaskQuestion(EpisodePolicy, Question, Observer):
         agent: The agent that decides.
         task: The task.
         begin: Asks the policy.
+        answered: The answer. None until it has come.
     """
 
     handler = _GatheringHandler()
 
-    def __init__(
-        self, policy: EpisodePolicy, episode: AskedEpisode, agent: Agent, task: Task[Model]
-    ) -> None:
-        self.policy: Any = policy
+    def __init__(self, policy: Model, episode: Model, agent: Agent, task: Task[Model]) -> None:
+        self.policy: Model = policy
         self.agent = agent
         self.task = task
         self.deferred = policy.deferred
         observation = duplicate(agent.raw_observation)
-        self.begin = policy.prepare(episode, agent, observation, agent.info)
-        self._answer: Answer | None = None
+        self.begin = policy.prepare(episode, agent, observation, agent.info, later=True)
+        self.answered: Answer | None = None
 
     def note(self, answer: Answer) -> None:
         """Note the answer, which has come."""
-        self._answer = answer
-
-    @property
-    def is_answered(self) -> bool:
-        """Whether the answer has come."""
-        return self._answer is not None
-
-    def result(self) -> Action:
-        """Return the answer, or raise the error of the policy."""
-        return None if self._answer is None else self._answer.result()
+        self.answered = answer
 
     def answer(
         self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
     ) -> Action:
         """Return the answer. If the policy was not asked, let it or its substitute answer now."""
-        if self._answer is None:
+        if self.answered is None:
             return self.policy.answer(episode, agent, observation, info)
-        return self._answer.result()
+        return self.answered.result()
 
-    def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: Model, args: Args, kwargs: Kwargs) -> Model:
         """Reply to the question."""
         return episode.answer_by(self, self.agent)
 
 
 def question_of(
-    episode: AskedEpisode, driver: Driver, agent: Agent, policy: Policy
+    episode: Model, driver: Driver, agent: Agent, policy: Policy
 ) -> TaskQuestion | None:
     """Make the question for which a task of the model waits. None where none can wait.
 
@@ -291,16 +269,11 @@ class Gathered:
         self.questions = deque(questions)
         self._replies: list[Model] = []
 
-    @property
-    def question(self) -> TaskQuestion:
-        """The first question without a reply."""
-        return self.questions[0]
-
     def next_event(self, reply: Model, agent: Agent | None) -> Event | None:
         """Note the reply to a question; return the event of the next one, or None at the end."""
         self._replies.append(reply)
         self.questions.popleft()
-        return (self.question, (), BOUND) if self.questions else None
+        return (self.questions[0], (), BOUND) if self.questions else None
 
     def reply(self) -> Model:
         """Return the replies."""

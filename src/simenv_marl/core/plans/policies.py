@@ -282,12 +282,6 @@ class EpisodePolicy(ABC):
     ) -> Action:
         """Answer one decision at once."""
 
-    def prepare(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
-    ) -> Callable[[], Action | Awaitable[Action]]:
-        """Collect the arguments of a policy that waits. Return a function that asks it, later."""
-        raise NotImplementedError
-
     def respond(
         self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
     ) -> Action:
@@ -342,36 +336,34 @@ class AskingPolicy(EpisodePolicy):
         """Answer one decision. Wait for the answer if it must be awaited."""
         return wait_for(self.begin(episode, agent, observation, info))
 
+    def begin(self, *arguments: Any) -> Action | Awaitable[Action]:
+        """Ask the policy, with the arguments of ``answer``. Return its answer, or an awaitable."""
+        return self.prepare(*arguments)()
+
     def prepare(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+        self,
+        episode: AskedEpisode,
+        agent: AskedAgent,
+        observation: Observation,
+        info: Info,
+        *,
+        later: bool = False,
     ) -> Callable[[], Action | Awaitable[Action]]:
-        """Collect the arguments of the policy. Return a function that asks it, later."""
-        asked, ask = self._prepare(episode, agent, observation, info)
-        getattr(asked.get("_decision"), "display", None)  # which shows the model as it is now
-        return ask
-
-    def begin(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
-    ) -> Action | Awaitable[Action]:
-        """Ask the policy. Return its answer, or an awaitable."""
-        return self._prepare(episode, agent, observation, info)[1]()
-
-    def _prepare(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
-    ) -> tuple[Mapping[str, object], Callable[[], Action | Awaitable[Action]]]:
         """Collect the arguments of the policy, or its substitute where the episode is played.
 
-        Return those that it asks for by name, and a function that asks.
+        Return a function that asks. ``later``: it is called when the model has gone on.
         """
         policy = self.policy
         if not self._is_asked_everywhere:
             policy = policy_for(policy, agent.name, episode.where)
         if policy is RULE:
-            return {}, lambda: RULE
+            return lambda: RULE
         call = self._call if policy is self.policy else Caller(policy)
         asked = {name: _look_up(name, episode, agent) for name in call.names}
+        if later:
+            getattr(asked.get("_decision"), "display", None)  # it shows the model as it is now
         ask = partial(call, observation, info, asked)
-        return asked, partial(self._time, agent, ask) if asked else ask  # else it is quick
+        return partial(self._time, agent, ask) if asked else ask  # else it is quick, as a rule
 
     def _time(self, agent: AskedAgent, ask: Callable[[], Action]) -> Action | Awaitable[Action]:
         """Ask, and count the seconds."""

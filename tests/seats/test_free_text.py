@@ -96,6 +96,25 @@ def test_recordings_and_files_repeat_texts(env, tmp_path):
     assert again.unwrapped.simulation.level == env.unwrapped.simulation.level
 
 
+class Lazy:
+    """Loads itself when it is looked at, as modules of clients do."""
+
+    @property
+    def __class__(self):
+        LAZY["loaded"] = 1
+        return Lazy
+
+
+LAZY = {"one": Lazy()}
+
+
+def test_a_file_is_written_beside_modules_that_load_when_looked_at(env, tmp_path):
+    LAZY.pop("loaded", None)
+    env.step("yes")
+    save_episode(env, tmp_path / "episode")
+    assert "loaded" in LAZY
+
+
 def test_it_is_an_observation_too():
     points = {
         Tank.fill: FILL,

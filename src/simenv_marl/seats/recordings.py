@@ -10,6 +10,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 import numpy as np
+from gymnasium.spaces import Tuple
 
 from ..core import Decision, PolicyWrapper, Space, split_extras
 from ..errors import OptionValueError, warn_user
@@ -192,7 +193,7 @@ def _outcome_in(entry: Entry, space: Space) -> Outcome:
         return Outcome(RULE if sample is None else space.from_jsonable(sample)[0])
     action = RULE if entry["action"] is None else decode_value(entry["action"])
     if type(action) is list:  # older recordings have no types
-        action = np.array(action, space.dtype)
+        action = tuple(action) if isinstance(space, Tuple) else np.array(action, space.dtype)
     extras = {name: decode_value(part) for name, part in entry.get("extras", {}).items()}
     others = {name: entry[name] for name in ("by", "why", "counts") if name in entry}
     return Outcome(action, extras, **others)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -258,8 +258,9 @@ class Handlers:
 
     def announced(
         self, expected_calls: Callable[[str], Iterable[Args]], points: Iterable[Point]
-    ) -> Iterator[tuple[PointHandler, Model, Args, Kwargs]]:
-        """Yield the announced decisions at points: handler, agent's name and arguments of each."""
+    ) -> list[tuple[PointHandler, Model, Args, Kwargs]]:
+        """Return the announced decisions at points: handler, agent's name and arguments of each."""
+        found = []
         for plan_point in points:
             handler = self.by_point[plan_point]
             point = handler.point
@@ -267,7 +268,8 @@ class Handlers:
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
                     if name is not None:
-                        yield handler, name, args, kwargs
+                        found.append((handler, name, args, kwargs))
+        return found
 
     def with_agents(self, agents: Iterable[Agent]) -> dict[Hook, AnyHandler]:
         """Return the handlers, with agents in place of those of their points where they can."""

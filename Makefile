@@ -8,7 +8,7 @@ BIN := .venv/bin
 # Tests start hundreds of processes, each of which would compile the library anew where this is set.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-clients test-benchmarl test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-language test-openenv test-openai test-trl test-negotiation test-clients test-benchmarl test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -38,7 +38,7 @@ test-studies: .venv/.test .venv-bounds/.bounds
 	.venv-bounds/bin/python -m pytest tests/studies/test_bounds.py
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
-test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
+test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-language test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
 # The quickest of them, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
@@ -92,6 +92,37 @@ test-browser: .venv-browser/.browser
 .venv-clients/.clients .venv-rllib/.rllib .venv-benchmarl/.benchmarl .venv-wrappers/.wrappers .venv-browser/.browser .venv-bounds/.bounds: pyproject.toml
 	test -x $(@D)/bin/python || $(OLDEST_PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
+	touch $@
+
+# Language models: trainers and frameworks that pin other packages, each in its own virtual environment.
+test-language: test-openenv test-openai test-trl test-negotiation
+
+test-openenv: .venv-openenv/.openenv
+	.venv-openenv/bin/python -m pytest tests/language
+
+# Trainers pin the client's version 2.
+test-openai: .venv-openai/.experiments
+	for version in 2 3; do \
+	    .venv-openai/bin/pip install --quiet --disable-pip-version-check --upgrade "openai==$$version.*" || exit; \
+	    .venv-openai/bin/python -m pytest --quiet tests/seats/test_language.py tests/seats/test_tables.py || exit; \
+	done
+
+.venv-openenv/.openenv .venv-openai/.experiments: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]' hypothesis pytest simpy
+	touch $@
+
+# The pages' examples. The second one is in no wheel, and needs Python 3.12; without that, it is skipped.
+test-trl: .venv-trl/.trl
+	HF_HUB_OFFLINE=1 TRL_EXPERIMENTAL_SILENCE=1 .venv-trl/bin/python docs/battery_trl.py
+
+test-negotiation:
+	sh tools/negotiation.sh
+
+.venv-trl/.trl: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check torch==2.13.0
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable . 'trl>=1.16'
 	touch $@
 
 # The oldest supported versions of all dependencies, with the tests of the order of events.

@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 from tests.worlds.undone import models_of_pages_forgotten, registries_put_back
 
-# A model that is only found from a page, one that is a process, and three that need a learner.
-collect_ignore = ["bakery_env.py", "dam.py", "hive_torchrl.py", "one_file.py", "quickstart.py"]
+# A model that is only found from a page, one that is a process, and five that need other packages.
+collect_ignore = [
+    *("bakery_env.py", "dam.py", "hive_torchrl.py", "one_file.py", "quickstart.py"),
+    *("battery_trl.py", "negotiation.py"),
+]
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""The command line: ``python -m simenv_marl new|check|inspect|play|replay|wire-check``.
+"""The command line: ``python -m simenv_marl new|check|inspect|play|serve|replay|wire-check``.
 
 Exit codes: 0 for success; 1 if a check has found errors; 2 if an argument is invalid, the
 simulation cannot be made, or a file cannot be written.
@@ -18,6 +18,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from .envs import single_env
 from .errors import OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
 from .simulation import Model
 from .testing import CheckReport, Inspection, check_simulation, inspect_simulation
@@ -45,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     about = (
-        "Write a template to start from; check, inspect or play a simulation; repeat the episode of"
-        " a file; test a simulator in another process."
+        "Write a template to start from; check, inspect, play or serve a simulation; repeat the"
+        " episode of a file; test a simulator in another process."
     )
     parser = argparse.ArgumentParser(prog="python -m simenv_marl", description=about)
     commands = parser.add_subparsers(required=True, metavar=" | ".join(_COMMANDS))
@@ -104,6 +105,13 @@ def _play(
         record=options["record"],
     )
     return start(make, **options)
+
+
+def _serve(simulation: str, seat: str, port: int) -> str:
+    from .seats.openenv import run
+
+    make = partial(single_env, find_simulation(simulation), agent=seat)
+    return run(make, simulation.rpartition(":")[2], port)
 
 
 def _replay(file: Path, until: int | None, play: bool, port: int) -> str:
@@ -320,6 +328,20 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., object], str, _Arguments]]] = {
                 "choices": ("all", "facilitator", "none"),
                 "default": "all",
                 "help": "who may undo, jump, restart and let the rule play on (default: all)",
+            },
+        },
+    ),
+    "serve": (
+        _serve,
+        "serve an agent's seat as an OpenEnv environment, on the loopback address",
+        {
+            **_SIMULATION,
+            "--seat": {"required": True, "metavar": "AGENT", "help": "the agent"},
+            "--port": {
+                "type": int,
+                "default": 8000,
+                "metavar": "P",
+                "help": "where to serve it; 0: any free port (default: 8000)",
             },
         },
     ),

@@ -6,6 +6,7 @@ import gc
 import os
 import threading
 import weakref
+from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -202,6 +203,38 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error():
         else:
             assert REFUSED in str(caught.value)
             assert len(caught.value.__notes__) == 1
+
+
+class InTurn(futures.Executor):
+    """Runs each call when it is submitted, in place of a ``ThreadPoolExecutor``."""
+
+    def submit(self, function, /, *args, **kwargs):
+        future = futures.Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@EVERY_DRIVER
+def test_an_executor_that_runs_in_turn_takes_the_place_of_threads(monkeypatch):
+    def main(simulation):
+        with futures.ThreadPoolExecutor() as pool:
+            simulation.log += pool.map(lambda number: (number, decide()), range(3))
+
+    decide = decision()
+    env = single_env(script(main), decide)
+    with pytest.raises(WrongThreadError, match="as executors that run in turn do"):
+        env.reset()
+    monkeypatch.setattr(futures, "ThreadPoolExecutor", InTurn)
+    env.reset()
+    for action in (4, 5, 6):
+        env.step(action)
+    assert env.simulation.log == [(0, 4), (1, 5), (2, 6)]
+    env.close()
+    env.reset()
+    env.close()
 
 
 @EVERY_DRIVER

@@ -277,6 +277,27 @@ def test_recordings_of_older_versions_are_read(path):
     assert seen == [1, 0, 1, 2]
 
 
+UNTYPED = {
+    "box": (spaces.Box(-1, 1, (2,), np.float32), [0.1, -0.7], np.array([0.1, -0.7], np.float32)),
+    "tuple": (spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.Discrete(3)]), [[0.5], 1], ([0.5], 1)),
+    "dict": (spaces.Dict(x=spaces.Box(0, 1, (2,))), {"x": [0.5, 0.1]}, {"x": [0.5, 0.1]}),
+}
+
+
+@pytest.mark.parametrize("kind", UNTYPED)
+def test_actions_of_recordings_without_types_are_read(kind, tmp_path):
+    space, written, action = UNTYPED[kind]
+    seen, path = [], tmp_path / "answers"
+    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
+    played(RecordedPolicy(lambda observation: space.sample(), path), points=points)
+    lines = [json.loads(line) | {"action": written} for line in path.read_text().splitlines()[:1]]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    seen.clear()
+    played(RecordedPolicy(lambda observation: space.sample(), path), points=points)
+    assert space.contains(seen[0])
+    np.testing.assert_allclose(spaces.flatten(space, seen[0]), spaces.flatten(space, action))
+
+
 PARTS = {
     "box": (spaces.Box(-1, 1, (2,), np.float32), np.array([0.1, -0.7], np.float32)),
     "scalar": (spaces.Box(0, 1, (1,), np.float64), 0.1 + 0.2),

@@ -30,7 +30,7 @@ def names_of(things: Collection[object]) -> dict[int, str]:
         for attribute, value in [*vars(module).items()]:
             values = [value]
             if type(value) is dict:
-                values += [part for part in value.values() if isinstance(part, Definition)]
+                values += [part for part in [*value.values()] if isinstance(part, Definition)]
             for each in values:
                 name = f"{module.__name__}.{attribute}"
                 if id(each) in wanted and (each is not value or _leads_to(name, each)):

@@ -136,10 +136,16 @@ class PolicyKey(DeferredPolicy):
         policy = batch_policy.policy
         self.takes_state = batch_policy.takes_state
         if isinstance(policy, EpisodePolicy):
+            self.waits = policy.waits
             self.looks_back = policy.looks_back
             self.sees_all = policy.sees_all
             self.plans = policy.plans
             self.asks = policy.asks
+
+    @property
+    def prepare(self) -> Any:
+        """Collects the arguments of a policy that waits."""
+        return getattr(self.batch_policy.policy, "prepare", None)
 
     def answer(
         self,
@@ -328,6 +334,7 @@ class BatchRun:
         # Decisions of policies that are awaited.
         self._backlog: deque[tuple[int, Episode, Callable[[], Action]]] = deque()
         self._awaited = PendingAnswers()
+        self._asking: set[int] = set()  # the places of their episodes
         self._unmatched = UnmatchedNames(self.plan.named_agents)
 
     def run(self) -> None:
@@ -362,10 +369,14 @@ class BatchRun:
 
     def _proceed(self) -> None:
         """Have decisions answered, and run their simulations to their next decisions."""
-        while self._backlog and len(self._awaited) < self.concurrency:
+        while self._backlog and len(self._asking) < self.concurrency:
             place, episode, begin = self._backlog.popleft()
+            self._asking.add(place)
             try:
-                self._awaited.add((place, episode), begin())
+                for question in episode.questions:
+                    self._awaited.add((place, episode, question), question.begin())
+                if not episode.questions:
+                    self._awaited.add((place, episode, None), begin())
             except BaseException as error:
                 episode.annotate(error)
                 raise
@@ -374,7 +385,13 @@ class BatchRun:
         if group is not None and group.waiting and not self._awaited.ready:
             self._answer(group)
         elif self._awaited:
-            (place, episode), answer = self._awaited.take()
+            (place, episode, question), answer = self._awaited.take()
+            if question is not None:
+                question.note(answer)
+                if not all(each.answered for each in episode.questions):
+                    return
+                answer = episode.questions[0].answered
+            self._asking.remove(place)
             self._step(place, episode, answer.result)
             self._queue(place, episode)
 
@@ -387,6 +404,9 @@ class BatchRun:
                 self._end(place, episode)
                 return
             agent, key = _pending(episode)
+            if episode.questions and episode.questions[0].answered:
+                self._step(place, episode, episode.questions[0].answered.result)
+                continue
             if not key.batch_policy.alone:
                 group = key.batch_policy.group(agent.point)
                 group.waiting.append((place, episode, agent.raw_observation, agent.take_info()))

@@ -58,6 +58,7 @@ EXTRAS: Final = {
     "pyDOE": "design",
     "SALib": "design",
     "openai": "language",
+    "openenv": "openenv",
     "stable_baselines3": "clients",
     "starlette": "play",
     "uvicorn": "play",

@@ -7,7 +7,7 @@ repeats their answers.
 
 from ..core import Decision
 from .answers import parse
-from .descriptions import describe
+from .descriptions import describe, free_text
 from .language import LanguageModelPolicy
 from .policies import FallbackPolicy, RecordedPolicy
 
@@ -17,5 +17,6 @@ __all__ = [
     "LanguageModelPolicy",
     "RecordedPolicy",
     "describe",
+    "free_text",
     "parse",
 ]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ..core import Decision, Labels, Space
 from ..errors import InvalidActionError, short_repr
 from ..simulation import Action
-from .descriptions import JSON, at_decision, label_of_part, legal_lines
+from .descriptions import JSON, FreeText, at_decision, label_of_part, legal_lines
 
 MISFITS: Final = (ValueError, TypeError, LookupError, OverflowError, RecursionError)
 """The errors of values that are no actions, with ``InvalidActionError``, a ``ValueError``."""
@@ -52,9 +52,9 @@ def parse(env_or_decision: object, text: str) -> Action:
     A text names an action by its label, by its value, or as JSON such as ``{"action": "open"}``.
     Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys.
     Other text may stand around a JSON object, which may have further keys, and around the only
-    label in the text; labels of masked actions count, too. The action of a ``Text`` space is the
-    text itself. The action is one of the agent whose decision is pending, for ``env.unwrapped``:
-    wrappers may take other actions.
+    label in the text; labels of masked actions count, too. The action of a ``Text`` or
+    ``free_text`` space is the text itself. The action is one of the agent whose decision is
+    pending, for ``env.unwrapped``: wrappers may take other actions.
 
     Raises:
         InvalidActionError: The text names no legal action, or several actions. The error lists the
@@ -99,7 +99,8 @@ def _named(text: str, decision: Decision) -> Action:
         *_, value = [..., *_objects(text)]
     answers = _at_action(value)
     if is_text and not (answers or isinstance(value, str)):
-        return read(text)  # any other JSON is a text, too
+        # Any other JSON is a text, too. Models put blanks around a text.
+        return read(text.strip() if isinstance(space, FreeText) else text)
     if value is ...:
         return read(_label_in(text, labels if isinstance(space, Discrete) else None))
     for answer in (*answers, value):  # an object may be the action itself

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
+from string import printable
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -15,12 +16,13 @@ from gymnasium.spaces import (
     MultiDiscrete,
     Text,
     Tuple,
+    flatten_space,
 )
 from numpy.typing import NDArray
 
 from ..core import Decision, Labels, Mask, Space, pending_view
 from ..errors import ViewError, short_repr
-from ..simulation import Observation
+from ..simulation import Observation, check_count
 
 MOST: Final = 200
 """The largest number of parts of an observation that are listed one by one."""
@@ -33,6 +35,40 @@ JSON: TypeAlias = "Mapping[str, JSON] | Sequence[JSON] | str | float | None"
 
 UNLABELLED_NUMBER: Final = ("0",)
 """The labels of a ``Box`` of one number that the user has not labelled."""
+
+
+class FreeText(Text):
+    """A space of any text up to a length. Its samples are of ASCII characters."""
+
+    is_np_flattenable = False
+
+    def __init__(self, longest: int) -> None:
+        """Make a space of texts of at most ``longest`` characters."""
+        super().__init__(longest, min_length=0, charset=printable)
+
+    def contains(self, x: object) -> bool:
+        """Return whether a value is a text that is not too long."""
+        return isinstance(x, str) and len(x) <= self.max_length
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FreeText) and self.max_length == other.max_length
+
+    def __repr__(self) -> str:
+        return f"free_text({self.max_length})"
+
+
+flatten_space.register(FreeText, lambda space: space)  # because it has no list of characters
+
+
+def free_text(n: int) -> Space:
+    """Make the space of any text of at most ``n`` characters, for actions and observations.
+
+    Gymnasium's ``Text`` is for texts of a given set of characters.
+
+    Raises:
+        OptionValueError: ``n`` is no positive integer.
+    """
+    return FreeText(check_count(n, "n", 1))
 
 
 def describe(
@@ -209,6 +245,8 @@ def limits_of(schema: Schema) -> str:
             return f"({', '.join(texts)})"
         case {"minLength": least, "maxLength": most, "pattern": pattern}:
             return f"{least} to {most} characters of {pattern[2:-3]}"
+        case {"maxLength": most}:
+            return f"any text of at most {most} characters"
         case {"minimum": low, "maximum": high}:
             return f"{noun} from {_value_text(low)} to {_value_text(high)}"
         case {"minimum": low}:
@@ -241,6 +279,8 @@ def schema_of(space: Space, labels: Labels) -> Schema:
     match space:
         case Discrete():
             return _range(int(space.start), int(space.start + space.n - 1))
+        case FreeText():
+            return {"type": "string", "maxLength": space.max_length}
         case Text():
             characters = re.sub(r"([]\\^-])", r"\\\1", space.characters)
             return {

@@ -10,7 +10,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 import numpy as np
-from gymnasium.spaces import Dict, Graph, OneOf, Sequence, Tuple
+from gymnasium.spaces import Tuple
 
 from ..core import Decision, PolicyWrapper, Space, split_extras
 from ..errors import OptionValueError, warn_user
@@ -120,8 +120,7 @@ class Recording(Lines):
     def write(self, question: Entry, outcome: Outcome, decision: Decision) -> None:
         """Append the outcome of a decision."""
         entry = question | vars(outcome) | {"run": self._run}
-        is_rule = outcome.action is RULE
-        entry["action"] = None if is_rule else encode(decision.action_space, outcome.action)
+        entry["action"] = None if outcome.action is RULE else encode_value(outcome.action)
         entry["extras"] = {name: encode_value(part) for name, part in outcome.extras.items()}
         optional = ("policy", "extras", "why", "counts")
         entry = {name: part for name, part in entry.items() if part or name not in optional}
@@ -192,36 +191,9 @@ def _outcome_in(entry: Entry, space: Space) -> Outcome:
     if "answer" in entry:
         sample = entry["answer"]
         return Outcome(RULE if sample is None else space.from_jsonable(sample)[0])
-    action = RULE if entry["action"] is None else decode(space, entry["action"])
+    action = RULE if entry["action"] is None else decode_value(entry["action"])
+    if type(action) is list:  # older recordings have no types
+        action = tuple(action) if isinstance(space, Tuple) else np.array(action, space.dtype)
     extras = {name: decode_value(part) for name, part in entry.get("extras", {}).items()}
     others = {name: entry[name] for name in ("by", "why", "counts") if name in entry}
     return Outcome(action, extras, **others)
-
-
-# -- actions as JSON ------------------------------------------------------------------------------
-
-
-def encode(space: Space, action: Action) -> Any:
-    """Return a legal action as JSON. ``decode`` returns the same action, of the same types."""
-    match space:
-        case Dict():
-            return {name: encode(space[name], part) for name, part in action.items()}
-        case Tuple():
-            return [encode(*pair) for pair in zip(space.spaces, action, strict=True)]
-        case Sequence() | Graph() | OneOf():
-            return space.to_jsonable([action])
-    if isinstance(action, np.ndarray) and action.ndim and action.dtype == space.dtype:
-        return action.tolist()
-    return encode_value(action)
-
-
-def decode(space: Space, value: Any) -> Action:
-    """Return an action from its JSON."""
-    match space:
-        case Dict():
-            return {name: decode(space[name], part) for name, part in value.items()}
-        case Tuple():
-            return tuple(decode(*pair) for pair in zip(space.spaces, value, strict=True))
-        case Sequence() | Graph() | OneOf():
-            return space.from_jsonable(value)[0]
-    return np.array(value, space.dtype) if isinstance(value, list) else decode_value(value)

@@ -5,12 +5,10 @@ A decision::
     simulation                     episode, on its user's stack
     ----------                     ----------------------------
     calls a decision function
-      suspended          ------>   ``handle``: find the agent; if the rule decides, back to the
-                                     simulation
+      suspended          ------>   ``handle``: find the agent; or the rule decides
                                    ``Agent.update``: reward of the previous action (the first of an
                                      episode is dropped), legal actions, info, observation
-                                   if a policy answers (``ask``), back to the
-                                     simulation with its action
+                                   ``ask``: a policy answers at once, or a task of the model waits
                                    else PENDING, until the user answers
                                    ``answer``: map the checked action to the reply
       returns            <------   ``advance``
@@ -26,7 +24,7 @@ functions run their rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from sys import maxsize
 from typing import Any
@@ -40,7 +38,6 @@ from ...hooks.stacks import EVALUATING
 from ...simulation import EVERYONE, RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
-    DeferredPolicy,
     EpisodePolicy,
     Where,
     policy_for,
@@ -52,7 +49,7 @@ from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, DecisionHandler
 from .base import GO_ON, LONGEST_TAPE, Branched, EpisodeOwner, Replay, Tape
-from .split import SplitCall
+from .split import Gathered, SplitCall, TaskQuestion, has_waiting, question_of
 from .state import RUNNING, EpisodeState, Outcome, checked_actions, missing_decision
 from .steps import Round, Team
 
@@ -113,11 +110,11 @@ class Episode(EpisodeState):
         self.team: Team | None = None
         if plan.options.team_reward is not None:
             self.team = Team(partial(plan.options.team_reward, simulation), self._plugins)
-        self.is_plain = not (in_rounds or self.skips or self.team)
+        self.is_plain = not (in_rounds or self.skips or self.team or plan.derive(has_waiting))
         self.tape = session.new_tape()
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
-        self._split: SplitCall | None = None
+        self._split: SplitCall | Gathered | None = None
         self._observes = isinstance(plan.options.state_space, str)  # observations are states
         self.end_states: dict[Agent, Model] | None = None
         self._latest_state: tuple[int, Model] = (-1, None)  # the turn, and the state
@@ -290,7 +287,7 @@ class Episode(EpisodeState):
                 return reply
         if self.team is not None:
             self.earned = self.team.settle([agent])
-        return agent
+        return self._question(agent, agent.policy) or agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -349,15 +346,20 @@ class Episode(EpisodeState):
                 return reply
         if self._observes or (isinstance(policy, EpisodePolicy) and policy.looks_back):
             agent.keep(args, kwargs)
-        if isinstance(policy, DeferredPolicy) and not self.is_branch:
-            return agent
-        action = self._consult(agent, policy)
-        if action is WAIT:
-            return WAIT
-        return agent.reply_to(action if action is RULE else agent.validate(action))
+        return self._question(agent, policy) or self.answer_by(policy, agent)
 
-    def _consult(self, agent: Agent, policy: Policy) -> Action:
-        """Call the policy of an agent. ``WAIT`` where a replay ends."""
+    def _question(self, agent: Agent, policy: Policy) -> TaskQuestion | None:
+        """Make the question for which a task of the model waits. None if it is asked at once."""
+        return None if self._split else question_of(self, self.driver, agent, policy)
+
+    def answer_by(self, policy: Policy, agent: Agent) -> Model:
+        """Let a policy answer. Return the reply, the agent if it is asked later, or ``WAIT``."""
+        self.latest = agent
+        if not agent.delegated and self.turns >= self._most_steps:
+            self.finish(truncated=True)
+            return WAIT
+        if isinstance(policy, EpisodePolicy) and policy.deferred and not self.is_branch:
+            return agent
         if self.replay and self.replay[0] is GO_ON:
             self.replay = None
         if self.replay is not None:
@@ -378,13 +380,17 @@ class Episode(EpisodeState):
             if type(action) is tuple:
                 action, _ = split_extras(action, agent.point.definition.action_space)
         self.record(action)
-        return action
+        return agent.reply_to(action if action is RULE else agent.validate(action))
 
     def record(self, action: Action) -> None:
         """Keep a copy of an answer for replays."""
         if len(self.tape) < self._tape_size:
-            is_constant = type(action) is int or action is RULE
-            self.tape.append(action if is_constant else duplicate(action))
+            self.tape.append(duplicate(action))
+
+    @property
+    def questions(self) -> Sequence[TaskQuestion]:
+        """The questions that wait together, while the first of them is pending."""
+        return self._split.questions if isinstance(self._split, Gathered) else ()
 
     @property
     def is_recorded(self) -> bool:
@@ -400,11 +406,11 @@ class Episode(EpisodeState):
         """Make the environment that a planner gets."""
         return self.plan.subject.planner_view(self.session())
 
-    def begin_split(self, call: SplitCall) -> None:
+    def begin_split(self, call: SplitCall | Gathered) -> None:
         """Decide the items of a call, before the simulation moves."""
         self._split = call
 
-    def _next_item(self, call: SplitCall, reply: Model) -> Event:
+    def _next_item(self, call: SplitCall | Gathered, reply: Model) -> Event:
         """Return the event of a call's next item. After the last one, resume the simulation."""
         event = call.next_event(reply, self.latest)
         if event is not None:
@@ -494,22 +500,17 @@ class Episode(EpisodeState):
         if expected_calls is None:
             return
         known = {deciding}
-        for plan_point in self.plan.points if everyone else self.plan.active:
-            handler = self._handlers.by_point[plan_point]
-            point = handler.point
-            for call in expected_calls(point.hook.name):
-                for args, kwargs in point.decisions_of(call):
-                    name = point.agent or point.name_agent(*args, **kwargs)
-                    agent = self.find(name) if isinstance(name, str) else None
-                    if agent is not None:
-                        is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
-                        if agent in known or agent.ended or not (everyone or is_asked):
-                            continue  # it stays at its point
-                    if name is not None:
-                        agent = self.agent_for(handler, name)
-                        known.add(agent)
-                        if everyone or not agent.delegated:
-                            agent.keep(args, kwargs)
+        points = self.plan.points if everyone else self.plan.active
+        for handler, name, args, kwargs in self._handlers.announced(expected_calls, points):
+            agent = self.find(name) if isinstance(name, str) else None
+            if agent is not None:
+                is_asked = not agent.delegated and (self.in_rounds or not agent.decided)
+                if agent in known or agent.ended or not (everyone or is_asked):
+                    continue  # it stays at its point
+            agent = self.agent_for(handler, name)
+            known.add(agent)
+            if everyone or not agent.delegated:
+                agent.keep(args, kwargs)
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on.

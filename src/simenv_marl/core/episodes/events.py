@@ -256,6 +256,21 @@ class Handlers:
     roster: Mapping[str, tuple[PointHandler, Policy, bool]]
     alone: Collection[Hook]
 
+    def announced(
+        self, expected_calls: Callable[[str], Iterable[Args]], points: Iterable[Point]
+    ) -> list[tuple[PointHandler, Model, Args, Kwargs]]:
+        """Return the announced decisions at points: handler, agent's name and arguments of each."""
+        found = []
+        for plan_point in points:
+            handler = self.by_point[plan_point]
+            point = handler.point
+            for call in expected_calls(point.hook.name):
+                for args, kwargs in point.decisions_of(call):
+                    name = point.agent or point.name_agent(*args, **kwargs)
+                    if name is not None:
+                        found.append((handler, name, args, kwargs))
+        return found
+
     def with_agents(self, agents: Iterable[Agent]) -> dict[Hook, AnyHandler]:
         """Return the handlers, with agents in place of those of their points where they can."""
         own = {agent.point.hook: agent for agent in agents if agent.point.hook in self.alone}

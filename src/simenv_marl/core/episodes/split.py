@@ -1,19 +1,26 @@
-"""Calls that decide for many entities at once: each item is a decision."""
+"""Calls that decide for many entities at once, and questions of tasks that wait together."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from asyncio import Task
+from collections import deque
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 from inspect import isgenerator
 from types import coroutine
 from typing import Protocol
 
-from ...errors import SimulationError
+from ...errors import AgentError, SimulationError
 from ...hooks.hook import BOUND
 from ...hooks.stacks import Interceptor
-from ...simulation import RULE, Model
-from ..plans.point import Args, Kwargs
-from ..switching.driver import Event
+from ...simulation import RULE, Action, Model, Observation
+from ..plans.plan import Plan
+from ..plans.point import Args, Kwargs, Policy
+from ..plans.policies import AskedAgent, AskedEpisode, EpisodePolicy, Info, Where, waits
+from ..switching.awaiting import Answer, Answers
+from ..switching.driver import Driver, Event, Observer
+from ..switching.loops import Question
+from ..values.spaces import duplicate
 from .agent import Agent, DecisionHandler, RunningEpisode
 
 
@@ -161,3 +168,113 @@ def _value(value: Model, kind: str) -> Generator[Model, Model, Model]:
     if kind == "function":
         return value
     return (yield from value if isgenerator(value) else value.__await__())
+
+
+# -- tasks that wait ------------------------------------------------------------------------------
+
+
+class _GatheringHandler(Observer):
+    """Handles the questions of tasks that wait together."""
+
+    def handle(self, episode: Model, args: Args, kwargs: Kwargs) -> Model:
+        """Have the policies asked at once, and reply to the first question."""
+        (questions,) = args
+        is_asked = episode.where is Where.USER and not episode.replay
+        if is_asked and not questions[0].deferred:
+            answers = Answers()
+            try:
+                for question in questions:
+                    episode.blame(question.agent)
+                    answers.add(question, question.begin())
+                while answers:
+                    question, answer = answers.take()
+                    question.note(answer)
+            finally:
+                answers.cancel()
+        episode.begin_split(Gathered(questions))
+        return questions[0].handle(episode, (), BOUND)
+
+
+class TaskQuestion(EpisodePolicy, Question, Observer):
+    """The question of a task to a policy that waits. It takes the policy's place, once answered.
+
+    Attributes:
+        agent: The agent that decides.
+        task: The task.
+        begin: Asks the policy.
+        answered: The answer. None until it has come.
+    """
+
+    handler = _GatheringHandler()
+
+    def __init__(self, policy: Model, episode: Model, agent: Agent, task: Task[Model]) -> None:
+        self.policy: Model = policy
+        self.agent = agent
+        self.task = task
+        self.deferred = policy.deferred
+        observation = duplicate(agent.raw_observation)
+        self.begin = policy.prepare(episode, agent, observation, agent.info, later=True)
+        self.answered: Answer | None = None
+
+    def note(self, answer: Answer) -> None:
+        """Note the answer, which has come."""
+        self.answered = answer
+
+    def answer(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Return the answer. If the policy was not asked, let it or its substitute answer now."""
+        if self.answered is None:
+            return self.policy.answer(episode, agent, observation, info)
+        return self.answered.result()
+
+    def handle(self, episode: Model, args: Args, kwargs: Kwargs) -> Model:
+        """Reply to the question."""
+        return episode.answer_by(self, self.agent)
+
+
+def question_of(
+    episode: Model, driver: Driver, agent: Agent, policy: Policy
+) -> TaskQuestion | None:
+    """Make the question for which a task of the model waits. None where none can wait.
+
+    Raises:
+        AgentError: Another task waits for an answer of the same agent.
+    """
+    if not (isinstance(policy, EpisodePolicy) and policy.waits):
+        return None
+    tasks = driver.tasks
+    task = tasks.current(driver.loop)
+    if task is None or agent.point.hook.kind != "coroutine":
+        return None
+    for other in tasks.questions(driver.loop):
+        if other.agent is agent:
+            raise AgentError(
+                f"the agent {agent.name!r} decides in two tasks that wait,"
+                f" {other.task.get_name()} and {task.get_name()}; let agent= name each"
+                " differently, or one task wait for the other"
+            )
+    return TaskQuestion(policy, episode, agent, task)
+
+
+def has_waiting(plan: Plan) -> bool:
+    """Return whether a policy of a plan waits."""
+    return any(map(waits, (plan.options.policies or {}).values()))
+
+
+class Gathered:
+    """Questions that are answered one after the other, as the items of a call are."""
+
+    def __init__(self, questions: Iterable[TaskQuestion]) -> None:
+        self.questions = deque(questions)
+        self._replies: list[Model] = []
+
+    def next_event(self, reply: Model, agent: Agent | None) -> Event | None:
+        """Note the reply to a question; return the event of the next one, or None at the end."""
+        self._replies.append(reply)
+        self.questions.popleft()
+        return (self.questions[0], (), BOUND) if self.questions else None
+
+    def reply(self) -> Model:
+        """Return the replies."""
+        return self._replies

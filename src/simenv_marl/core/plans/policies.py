@@ -257,6 +257,7 @@ class EpisodePolicy(ABC):
     Attributes:
         waits: Whether it must be awaited.
         batched: Whether it answers many decisions in one call, where many wait.
+        deferred: Whether the episode waits for it as for its user.
         looks_back: Whether it needs the arguments of decisions that were answered before.
         sees_all: Whether it sees all agents, so that those that end are observed for the last time.
         takes_state: Whether it needs the state of the simulation.
@@ -267,6 +268,7 @@ class EpisodePolicy(ABC):
 
     waits = False
     batched = False
+    deferred = False
     looks_back = False
     sees_all = False
     takes_state = False
@@ -306,6 +308,8 @@ class EpisodePolicy(ABC):
 class DeferredPolicy(EpisodePolicy):
     """A policy that answers many decisions in one call. An episode waits for it as for its user."""
 
+    deferred = True
+
 
 class AskingPolicy(EpisodePolicy):
     """A policy that is asked for one decision at a time."""
@@ -332,26 +336,44 @@ class AskingPolicy(EpisodePolicy):
         """Answer one decision. Wait for the answer if it must be awaited."""
         return wait_for(self.begin(episode, agent, observation, info))
 
-    def begin(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
-    ) -> Action | Awaitable[Action]:
-        """Ask the policy, or its substitute where the episode is played."""
+    def begin(self, *arguments: Any) -> Action | Awaitable[Action]:
+        """Ask the policy, with the arguments of ``answer``. Return its answer, or an awaitable."""
+        return self.prepare(*arguments)()
+
+    def prepare(
+        self,
+        episode: AskedEpisode,
+        agent: AskedAgent,
+        observation: Observation,
+        info: Info,
+        *,
+        later: bool = False,
+    ) -> Callable[[], Action | Awaitable[Action]]:
+        """Collect the arguments of the policy, or its substitute where the episode is played.
+
+        Return a function that asks. ``later``: it is called when the model has gone on.
+        """
         policy = self.policy
         if not self._is_asked_everywhere:
             policy = policy_for(policy, agent.name, episode.where)
         if policy is RULE:
-            return RULE
+            return lambda: RULE
         call = self._call if policy is self.policy else Caller(policy)
         asked = {name: _look_up(name, episode, agent) for name in call.names}
-        if not asked:  # a quick policy, as a rule
-            return call(observation, info, asked)
+        if later:
+            getattr(asked.get("_decision"), "display", None)  # it shows the model as it is now
+        ask = partial(call, observation, info, asked)
+        return partial(self._time, agent, ask) if asked else ask  # else it is quick, as a rule
+
+    def _time(self, agent: AskedAgent, ask: Callable[[], Action]) -> Action | Awaitable[Action]:
+        """Ask, and count the seconds."""
         start = perf_counter()
 
         def conclude(answer: Action) -> Action:
             agent.count(seconds=perf_counter() - start)
             return answer
 
-        answer = call(observation, info, asked)
+        answer = ask()
         return when_answered(answer, conclude) if self.waits else conclude(answer)
 
 

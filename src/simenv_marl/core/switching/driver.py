@@ -32,15 +32,12 @@ from ...hooks.limits import SECONDS_TO_UNWIND
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Function, Model, Sentinel
-from .exits import LoopExit, SimulationExit, is_exit, make_exit
-from .loops import NO_LOOP, swap_loop
+from .exits import UNWINDING_TRIES, LoopExit, SimulationExit, is_exit, make_exit
+from .loops import NO_LOOP, Tasks, swap_loop
 from .opened import Resource, watch_resources
 
 WAIT: Final = Sentinel("WAIT")
 """What ``handle`` returns instead of a reply if the episode waits for an action, or is over."""
-
-UNWINDING_TRIES: Final = 1000
-"""How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
 
 
 class Receiver(Protocol):
@@ -154,8 +151,8 @@ class Driver(ABC):
         idle: Whether no job runs.
         forked: Whether the simulation has forked this process.
         opened: The resources that the simulation has opened. None before the first one.
-        stale: Whether code of an earlier stack may still use the simulation, so that it must be
-            made anew.
+        tasks: The tasks that wait for replies.
+        stale: Whether it must be made anew, because code of an earlier stack may still use it.
         user: The number of the thread that began the latest job.
     """
 
@@ -163,7 +160,7 @@ class Driver(ABC):
         "__weakref__", "_context", "_deadlock", "_exiting", "_handled", "_home", "_loop",
         "_outcome", "_prepare", "_refused", "_spawned", "_stack", "_thread",
         "_users_loop", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
-        "plugins", "stale", "user",
+        "plugins", "stale", "tasks", "user",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
@@ -200,6 +197,7 @@ class Driver(ABC):
         self._exiting = False
         self._prepare: Callable[[], Job] | None = None  # until the job begins
         self._context = Context()  # of the job, until it begins
+        self.tasks = Tasks()
         self._loop = NO_LOOP  # of the simulation, while it waits
         self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
@@ -257,6 +255,11 @@ class Driver(ABC):
     def frame(self) -> FrameType | None:
         """The innermost frame of the simulation while it is suspended."""
         return None if self._stack is None else self._stack.gr_frame
+
+    @property
+    def loop(self) -> Model:
+        """The running event loop of the suspended simulation."""
+        return self._loop[0]
 
     @property
     def reachable(self) -> bool:
@@ -437,6 +440,7 @@ class Driver(ABC):
             prepare = job = None
             self.leave_hooks(self._stack)
             self.events = {}
+            self.tasks.clear()
         self._outcome = [result]
 
     def _explain(self, error: BaseException) -> BaseException:
@@ -519,6 +523,9 @@ class Driver(ABC):
             deliver = partial(deliver, send)
         elif send is not None:
             rule = _reporting(hook, send)
+        if hook.kind == "coroutine" and deliver is not None:
+            sender = partial(self._decider, hook, _ignore, deliver=None, away=away)
+            deliver = partial(self.tasks.deliver, sender, rule, deliver)
         return self._decider(hook, rule, handler, deliver, away)
 
     def _obstacle(self) -> str | None:
@@ -538,7 +545,7 @@ class Driver(ABC):
         """Refuse a decision. The user gets the error at the simulation's next event."""
         error = WrongThreadError(
             f"{hook.name} was called in {where}, where the environment cannot ask for a decision."
-            " Call it where run() runs, and pass the decision on"
+            " Call it where run() runs, as executors that run in turn do, or pass the decision on"
         )
         if self._refused is None and not self.forked:
             self._refused = error

@@ -6,7 +6,7 @@ from asyncio import AbstractEventLoop, Runner, _get_running_loop
 from collections.abc import Callable
 from functools import partial
 from traceback import walk_stack
-from typing import Any
+from typing import Any, Final
 
 from greenlet import getcurrent, greenlet
 
@@ -16,6 +16,10 @@ from ...simulation import Model
 
 Context = dict[str, Any]
 """The context that an event loop passes to its exception handler."""
+
+
+UNWINDING_TRIES: Final = 1000
+"""How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
 
 
 class SimulationExit(BaseException):

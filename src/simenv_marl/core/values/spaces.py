@@ -25,6 +25,7 @@ from gymnasium.spaces import (
     MultiDiscrete,
     OneOf,
     Sequence,
+    Text,
     Tuple,
 )
 from gymnasium.vector.utils import batch_space
@@ -317,8 +318,8 @@ def same(one: Observation, other: Observation) -> bool:
 def blank(space: Space) -> Observation:
     """Make the blank observation of an agent that was not observed yet.
 
-    It is zero, clipped into the space. For a space without a zero (text, graphs, ...) it is a fixed
-    sample.
+    It is zero, clipped into the space, or an empty text. For a space without a zero (graphs, ...),
+    it is a fixed sample.
     """
     match space:
         case Box():
@@ -331,6 +332,8 @@ def blank(space: Space) -> Observation:
             return {key: blank(part) for key, part in space.items()}
         case Tuple():
             return tuple(map(blank, space))
+        case Text(min_length=0):
+            return ""
     unseeded = deepcopy(space)  # the user may have seeded the space itself
     unseeded.seed(0)
     return unseeded.sample()

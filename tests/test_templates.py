@@ -136,7 +136,10 @@ def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
         follow_the_rule(template.env(), seed=7),
         simulate(template.MySimulation, {}, seed=7),
     ):
-        assert differences(fingerprint("simulation", other), fingerprint("simulation", plain)) == []
+        found = differences(fingerprint("simulation", other), fingerprint("simulation", plain))
+        # From 3.5 on, Mesa numbers all scenarios and events of a process.
+        numbers = ("._scenario_id", "._current_event.unique_id")
+        assert [each for each in found if not each.path.endswith(numbers)] == []
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -50,8 +50,8 @@ class MyModel:
         arrivals = self.streams["arrivals"]
         kinds = self.streams["kinds of jobs"]
         while True:
-            due = self.clock.now + kinds.choice([20.0, 120.0, 120.0, 120.0])
-            self.waiting.append(Job(kinds.choice([4.0, 8.0, 20.0]), due))
+            due = self.clock.now + float(kinds.choice([20.0, 120.0, 120.0, 120.0]))
+            self.waiting.append(Job(float(kinds.choice([4.0, 8.0, 20.0])), due))
             yield self.clock.timeout(arrivals.exponential(11.0))
 
     def paint(self) -> ProcessGenerator:

@@ -101,7 +101,7 @@ class Case(NamedTuple):
 
 def worth_of_queues(planners: dict[str, Any], seed: int) -> float:
     """Return the costs of the queues, negative."""
-    return -float(simulate(Queues, planners, seed=seed).costs_now())
+    return -float(simulate(Queues, planners, points=Queues.admit, seed=seed).costs_now())
 
 
 def worth_of_greenhouse(planners: dict[str, Any], seed: int) -> float:

@@ -72,7 +72,7 @@ LINES: Final = {
 
 def main(arguments: Sequence[str] | None = None) -> list[list[Any]]:
     """Measure the rules and the plan, and write the table and the figure."""
-    options = options_of("Plan production lines.", arguments, seeds=8, futures=2)
+    options = options_of("Plan production lines.", arguments, seeds=6, futures=2)
     constants = CONSTANTS
     if options.quick:
         options.seeds, options.futures, constants = 1, 1, (19,)

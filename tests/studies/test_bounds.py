@@ -30,6 +30,15 @@ def test_bounds_plans_production_lines(tmp_path, capsys):
     check_bounds(table, tmp_path, capsys.readouterr().out, files)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of gekko
+def test_bounds_plans_a_complex_line(tmp_path, capsys):
+    pytest.importorskip("lineflow.simulation")
+    from studies.bounds import complex_line
+
+    table = complex_line.main(["--quick", "--out", str(tmp_path)])
+    check_bounds(table, tmp_path, capsys.readouterr().out, ["bounds-complex-line.png"])
+
+
 def test_bounds_plans_inventories(tmp_path, capsys):
     pytest.importorskip("gym_invmgmt")
     from studies.bounds import inventory

@@ -11,6 +11,7 @@ from examples.greenhouse_coop import plan, train
 from examples.greenhouse_coop.env import DAYS, GreenhouseSim
 from examples.queue_admission.env import HORIZON
 from examples.queue_admission.model import Queue
+from studies.bases import measure as bases
 from studies.debt_collection import model as agency
 from studies.debt_collection import study as debts
 from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
@@ -97,6 +98,15 @@ def test_credit_compares_estimators_with_the_truth(capsys):
     assert paired.deviation < apart.deviation
     assert paired.days == 2 * returns.days
     assert all(way.title in shown for way in (returns, apart, paired, *others))
+
+
+def test_bases_compares_what_stands_for_other_planners(monkeypatch, capsys):
+    monkeypatch.setattr("studies.bases.model.END", 15.0)
+    monkeypatch.setattr("examples.greenhouse_coop.env.DAYS", 12)
+    table = bases.main(["--quick"])
+    shown = capsys.readouterr().out
+    assert [row[0] for row in table] == list(bases.CASES)
+    assert all(" ".join(row[:2]) in shown.replace(" | ", " ") for row in table)
 
 
 def test_event_planning_compares_planners_with_the_rule(monkeypatch):

@@ -83,7 +83,8 @@ def import_extra(module: str, feature: str) -> Any:
         package = module.partition(".")[0]
         extra = EXTRAS.get(package, "experiments")
         raise MissingExtraError(
-            f"{feature} needs {package}: install simenv-marl[{extra}] ({error})"
+            f"{feature} needs {package}: install simenv-marl[{extra}], in a checkout by"
+            f" pip install '.[{extra}]' ({error})"
         ) from None
 
 

@@ -3,6 +3,7 @@
 import re
 import time
 
+import joblib
 import pytest
 
 from simenv_marl import evaluate, reseed_generators, simulate, simulate_many
@@ -79,6 +80,8 @@ def stop(simulation):
 
 def test_a_long_run_in_workers_says_it_once(capfd):
     planner = RolloutPolicy([[0, 1], [1, 0]], futures=1, budget=5, every=12)
+    # Workers of other tests would print elsewhere.
+    joblib.externals.loky.get_reusable_executor().shutdown(wait=True)
     with pytest.raises(TimeoutError):
         simulate_many(
             VerySlow, {"push": planner}, seeds=range(200), workers=2, batch_size=1, collect=stop

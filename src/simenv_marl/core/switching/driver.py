@@ -248,7 +248,7 @@ class Driver(ABC):
         """Yield the variables of each frame of the suspended simulation."""
         frame = self.frame
         while frame is not None:
-            yield frame.f_locals
+            yield dict(frame.f_locals)  # from Python 3.13 on, f_locals shows no values to others
             frame = frame.f_back
 
     @property

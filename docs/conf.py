@@ -38,6 +38,7 @@ html_title = f"simenv_marl {release}"
 html_static_path = ["_static"]
 html_extra_path = ["_moved"]  # pages at old addresses, which lead to the new ones
 html_css_files = ["pages.css"]
+html_js_files = ["sidebar.js"]
 html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"top_of_page_buttons": []}

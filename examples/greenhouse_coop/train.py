@@ -230,7 +230,7 @@ def compare(
     spawned = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(workers, spawned) as pool,
-        tqdm(total=budget + 6 * seeds, unit="episode") as bar,
+        tqdm(total=budget + 6 * seeds, unit="episode", desc="constant amounts", delay=5) as bar,
     ):
 
         def run(

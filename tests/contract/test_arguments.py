@@ -133,7 +133,7 @@ class Ward(SimulationInterface):
         self.log.append(self.treat(["ada", "bob"], 5))
 
 
-def test_own_arguments_come_first_and_are_not_counted():
+def test_action_and_item_come_before_the_arguments_of_the_call():
     env = begun(
         aec_env(
             Ward,

@@ -392,7 +392,7 @@ def test_infos_have_time_elapsed_and_discount_in_every_view(view, rate):
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
-def test_rates_that_do_not_discount_are_refused(rate):
+def test_invalid_discount_rates_are_refused(rate):
     with pytest.raises(
         OptionValueError,
         match="discount_rate must be a finite number that is not negative, or None",

@@ -92,7 +92,7 @@ def test_contributions_add_up_to_the_difference(seed, driver, method, forced, st
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_the_baseline_may_be_any_policies(method):
+def test_ledger_baseline_may_be_any_policies(method):
     for baseline in (boldest, dict.fromkeys(POINTS, boldest), {"warden_0": boldest}):
         by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(POINTS, baseline)
         found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, baseline=baseline, method=method)

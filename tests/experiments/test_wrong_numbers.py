@@ -193,7 +193,7 @@ def test_the_warning_itself_comes_once():
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_trajectories_tell_which_episodes_are_wrong(workers):
+def test_trajectories_mark_episodes_with_wrong_numbers(workers):
     policies = {"gambler": RULE}
     for _ in range(2):
         found = collect_episodes(Casino, policies, seeds=SEEDS, points=BET, workers=workers)

@@ -474,7 +474,7 @@ def test_a_time_limit_ends_branches_that_hang():
         )
 
 
-def test_progress_is_shown_on_request(capsys):
+def test_action_values_show_progress_on_request(capsys):
     assert action_values(made("single"), futures=3, progress=True).counts.tolist() == [3, 3, 3]
     assert "9/9" in capsys.readouterr().err
 

@@ -550,7 +550,7 @@ def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
     assert time.monotonic() - begin < 2
 
 
-def test_a_restart_can_be_taken_back(make_host, tmp_path):
+def test_restart_of_a_game_can_be_undone(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     before = play(host, [1, 3])

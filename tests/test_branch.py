@@ -136,7 +136,7 @@ class Unpicklable(Exception):
         (lambda twin, number: time.sleep(600), 0.3, "longer than"),
     ],
 )
-def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, limit, message):
+def test_branch_that_dies_raises_an_error_and_the_environment_continues(function, limit, message):
     env, before = trip(), children()
     with pytest.raises(BranchError, match=message):
         branch(env, function, 2, method="fork", time_limit=limit)
@@ -158,7 +158,7 @@ def test_an_error_that_cannot_be_pickled_is_named():
 @pytest.mark.skipif(
     not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say"
 )
-def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
+def test_ending_a_branch_ends_its_nested_branches(tmp_path):
     def slow(twin, number):
         (tmp_path / str(os.getpid())).touch()
         time.sleep(600)
@@ -195,7 +195,7 @@ def test_a_model_that_does_not_repeat_itself_can_only_be_forked(tmp_path):
 
 
 @pytest.mark.parametrize("view", ["single", "parallel"])
-def test_too_many_decisions_to_be_kept(view, monkeypatch):
+def test_branch_by_replay_is_refused_after_too_many_decisions(view, monkeypatch):
     monkeypatch.setattr(run, "LONGEST_TAPE", 3)
     env = trip(view, taken=0)
     for _ in range(2):
@@ -254,7 +254,7 @@ WRONG_SEEDS = [
         ({"method": "clone"}, "method must be"),
     ],
 )
-def test_invalid_arguments_are_refused(given, message):
+def test_branch_refuses_invalid_arguments(given, message):
     with pytest.raises(OptionValueError, match=message):
         branch(trip(), never, **given)
 
@@ -264,7 +264,7 @@ def test_threads_cannot_be_forked():
         branch(trip(driver="thread"), never, method="fork")
 
 
-def test_not_from_inside_its_own_policies():
+def test_branch_from_a_policy_of_the_environment_is_refused():
     env = trip(taken=0, policies={"guide_0": lambda observation: branch(env, never)})
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
@@ -421,7 +421,7 @@ def held_by(model):
         (mapped("r+"), r"shared memory \(/tmp/"),
     ],
 )
-def test_what_cannot_be_forked_is_replayed_or_named(held, name):
+def test_resource_that_prevents_a_fork_is_named_or_replay_is_used(held, name):
     env = held_by(type("Model", (Holding,), {"open": held}))
     env.step(1)
     for copied in (partial(branch, env, never), partial(clone, env)):
@@ -487,7 +487,7 @@ class Listening(Holding):
         os.close(writing)
 
 
-def test_event_loops_of_asyncio_go_on_in_a_fork(monkeypatch):
+def test_asyncio_event_loops_continue_in_a_fork(monkeypatch):
     env = held_by(Listening)
     env.step(1)
     assert (
@@ -590,7 +590,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
 
 
 @METHODS
-def test_another_kind_of_generator_behind_numpys_functions(method):
+def test_branch_seeds_and_restores_any_global_numpy_bit_generator(method):
     """It is seeded whatever its kind, and put back as it was."""
     env, kept, mine = trip(), np.random.get_bit_generator(), np.random.PCG64(5)
     try:

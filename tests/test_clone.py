@@ -60,9 +60,7 @@ def number_of(twin):
 @METHODS
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(
-    view, options, method
-):
+def test_clones_and_branches_continue_alike_and_independently(view, options, method):
     given = dict(OPTIONS[options])
     if (options, method) == ("short", "replay"):  # threads cannot be forked
         given["driver"] = "thread"
@@ -119,7 +117,7 @@ def test_clones_of_stepped_clones_show_acts_and_times_of_the_original():
 
 
 @METHODS
-def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
+def test_checkpoint_rewinds_after_its_original_is_closed(method):
     env = trip("single, limited", taken=2)
     checkpoint = clone(clone(env, method=method), method=method)
     env.close()
@@ -142,7 +140,7 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
 
 
 @METHODS
-def test_wrappers_keep_count(method):
+def test_clones_keep_the_step_count_of_wrappers(method):
     env = trip("single, limited", Free)
     twin = clone(env, method=method)
     twin.step(1)
@@ -158,7 +156,7 @@ def test_wrappers_keep_count(method):
     assert last.step(1)[3] is outer.step(1)[3] is True
 
 
-def test_functions_are_called_where_the_clone_is_which_goes_on_to_its_end():
+def test_call_runs_functions_in_the_process_of_the_clone():
     twin, factor = clone(trip(), method="fork"), 2
     assert number_of(twin) != os.getpid() == number_of(clone(twin, method="replay"))
     assert twin.call(lambda env, by: (factor * by, env.step(1)[4]["time"]), 4) == (8, 3.0)
@@ -176,7 +174,7 @@ def test_functions_are_called_where_the_clone_is_which_goes_on_to_its_end():
 
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
-def test_errors_surface_as_themselves(view, method):
+def test_errors_in_clones_keep_their_type(view, method):
     failing = type("Failing", (Free,), {"luck": lambda trip: 1 / (1 - trip.day)})
     twin = clone(trip(view, failing, taken=0), method=method)
     before = twin.unwrapped.call(outcome)
@@ -337,7 +335,7 @@ ENDS += [(INTERRUPTED, "BranchError: the clone is gone: it was ended by an inter
 
 
 @pytest.mark.parametrize(("end", "error"), ENDS)
-def test_no_clone_outlives_its_users_process_and_interrupts_reach_that_alone(end, error, tmp_path):
+def test_clones_end_with_the_users_process_and_ignore_interrupts(end, error, tmp_path):
     command, told = [sys.executable, "-c", USER + end, str(tmp_path)], tmp_path / "told"
     options = {"cwd": ROOT, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
     with told.open("w") as file, subprocess.Popen(command, stderr=file, **options) as process:
@@ -355,7 +353,7 @@ def test_no_clone_outlives_its_users_process_and_interrupts_reach_that_alone(end
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_a_clone_that_dies_says_so_and_others_go_on():
+def test_clone_that_dies_raises_an_error_and_other_clones_continue():
     env = trip()
     killed, exits, late, other = (
         clone(env, method="fork", time_limit=limit) for limit in (60, 60, 0.3, float("inf"))
@@ -373,7 +371,7 @@ def test_a_clone_that_dies_says_so_and_others_go_on():
     assert future(other) == future(env)
 
 
-def test_the_number_of_a_clones_clone_that_has_ended_is_not_killed(monkeypatch):
+def test_pid_of_an_ended_clone_of_a_clone_is_not_killed(monkeypatch):
     """The system may have given the number to another process."""
     twin = clone(trip(), method="fork")
     deeper = clone(twin, method="fork")
@@ -411,7 +409,7 @@ def test_threads_use_a_clone_one_at_a_time(tmp_path):
     twin.step(1)
 
 
-def test_a_default_timeout_of_sockets_is_none_of_clones():
+def test_default_socket_timeout_does_not_affect_clones():
     socket.setdefaulttimeout(0.05)
     try:
         twin = clone(trip(), method="fork")
@@ -487,7 +485,7 @@ def lean():
 
 
 @pytest.mark.parametrize("function", [crowd, starve, lean])
-def test_clones_take_one_descriptor_each_and_leave_none(function):
+def test_clones_use_one_descriptor_each_and_leak_none(function):
     alone(function)
 
 
@@ -501,7 +499,7 @@ class Cyclic:
         self.me = self
 
 
-def test_forks_free_what_their_original_frees():
+def test_forked_clones_free_objects_that_the_original_frees():
     env = trip()
     model = env.simulation
     model.alive = [Cyclic(), Cyclic()]
@@ -518,7 +516,7 @@ def test_forks_free_what_their_original_frees():
     assert found == [count(env)] * 3 == [1] * 3
 
 
-def test_a_closed_link_of_a_chain_of_clones_is_freed():
+def test_closed_clone_within_a_chain_of_clones_is_freed():
     twin = clone(trip(), method="fork")
     depth = twin.call(lambda env: len(inspect.stack()))
     links = []
@@ -556,7 +554,7 @@ class Broken(Trip):
 
 @METHODS
 @pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
-def test_the_models_error_comes_before_those_that_follow_from_it(view, method):
+def test_model_error_surfaces_before_the_errors_that_follow_from_it(view, method):
     twin = clone(trip(view, Broken, taken=0), method=method)
     with pytest.raises(ZeroDivisionError, match="in the model"):
         all(True for _ in iter(lambda: move(twin), None))
@@ -619,7 +617,7 @@ def test_actions_that_cannot_be_sent_are_invalid(kind, view, method):
 # -- ends -----------------------------------------------------------------------------------------
 
 
-def test_the_end_of_a_process_is_never_told_as_success():
+def test_clone_whose_process_exits_is_always_an_error():
     twin = clone(trip(), method="fork")
     with pytest.raises(BranchError, match=r"has died, because .*os\._exit\(0\)"):
         twin.call(lambda env: os._exit(0))
@@ -653,7 +651,7 @@ def test_closed_clones_leave_no_zombie_to_a_first_process(order):
 
 
 @pytest.mark.parametrize("at", ["waitpid", "kill"])
-def test_a_second_close_ends_what_an_interrupted_one_has_left(at, monkeypatch):
+def test_second_close_ends_the_process_left_by_an_interrupted_one(at, monkeypatch):
     twin = clone(trip(), method="fork")
     number = number_of(twin)
 
@@ -699,7 +697,7 @@ def handled(place):
     assert {*Path(place).read_text(encoding="utf-8").split()} == {str(os.getpid())}
 
 
-def test_the_users_signal_handlers_run_in_the_users_process_alone(tmp_path):
+def test_signal_handlers_of_the_user_do_not_run_in_clones(tmp_path):
     alone(handled, str(tmp_path / "signals"))
 
 
@@ -713,7 +711,7 @@ def hold(env, number=0):
     HELD.acquire()
 
 
-def test_a_fork_that_waits_for_a_lock_for_ever_says_so():
+def test_fork_that_waits_for_a_lock_forever_raises_an_error():
     HELD.acquire()  # as by a thread that is not in the fork
     env = trip()
     began = time.monotonic()

@@ -48,7 +48,7 @@ def beside_the_models(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-def test_a_sound_simulation_of_the_current_directory():
+def test_command_check_finds_nothing_in_a_sound_simulation():
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
     command = [sys.executable, "-m", "simenv_marl", "check", "walking:Walk", "--episodes", "2"]
@@ -107,7 +107,7 @@ def test_points_can_be_given_by_name(capsys):
     ],
 )
 @pytest.mark.parametrize("command", ["check", "inspect"])
-def test_objects_that_are_no_simulation_are_refused(command, target, told, capsys):
+def test_commands_refuse_objects_that_are_no_simulation(command, target, told, capsys):
     assert main([command, target]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -149,7 +149,7 @@ def test_wrong_arguments_end_the_command_with_status_2(arguments, capsys):
         ),
     ],
 )
-def test_numbers_that_cannot_be_used(command, options, capsys):
+def test_commands_refuse_invalid_numbers(command, options, capsys):
     command, target = command.split()
     for each in options:
         option, value = each.split()

@@ -52,7 +52,7 @@ class BigPump(Pump):
     power = 30
 
 
-def test_outside_any_environment_a_decision_function_is_the_rule_and_keeps_its_binding():
+def test_decision_function_outside_environments_is_the_bound_rule():
     pump = Pump()
     assert (
         pump.flow(1.5, unit="m", fast=True)
@@ -72,7 +72,7 @@ def test_outside_any_environment_a_decision_function_is_the_rule_and_keeps_its_b
     assert (Pump.weakest(), BigPump().weakest()) == (-3, -30)
 
 
-def test_a_decision_function_keeps_its_looks_and_is_pickled_by_name():
+def test_decision_function_keeps_its_metadata_and_is_pickled_by_name():
     assert (Pump.flow.__name__, Pump.flow.__qualname__, Pump.flow.__module__) == (
         "flow",
         "Pump.flow",
@@ -91,7 +91,7 @@ def test_a_decision_function_keeps_its_looks_and_is_pickled_by_name():
         assert pickle.loads(pickle.dumps(function)) == function
 
 
-def test_sentinels_stay_themselves():
+def test_sentinels_survive_pickling():
     for sentinel in (RULE, TRUNCATED):
         assert pickle.loads(pickle.dumps(sentinel)) is sentinel
         assert repr(sentinel).startswith("simenv_marl.")
@@ -179,7 +179,7 @@ async def flow():
     [len, property(lambda self: 1), functools.partial(int), int, None, Pump().flow, flow],
     ids=plainly,
 )
-def test_only_functions_can_be_decided(function):
+def test_make_step_refuses_objects_that_are_no_functions(function):
     with pytest.raises(
         PatchError, match="is an async generator function" if function is flow else None
     ):
@@ -226,7 +226,7 @@ def told_by(env, *actions):
     ],
     ids=["from 0", "from -1"],
 )
-def test_a_dict_says_what_each_action_decides(space, answers, refused):
+def test_action_space_mapping_may_be_a_dict_of_decisions(space, answers, refused):
     decide = decision(action_space=space, action_space_mapping=answers)
     env = single_env(calling(*[decide] * len(answers)), decide)
     env.reset()
@@ -293,9 +293,7 @@ def finished(made):
         (order, apply_later, ([], (5, "tea")), ([], ("rule", "tea"))),
     ],
 )
-def test_what_a_generator_or_coroutine_returns_is_decided_when_it_starts(
-    function, apply, told, rule
-):
+def test_generator_or_coroutine_point_decides_when_it_starts(function, apply, told, rule):
     changes = {"apply": apply} if apply else {}
     decide = define(observation_space_mapping=lambda good: [len(started), 0], **changes)(function)
     started = []
@@ -323,7 +321,7 @@ def test_one_function_may_have_many_definitions():
         assert told == [["early"], ["late"], ["last"]]
 
 
-def test_choices_are_asked_once_with_the_arguments_and_make_the_mask():
+def test_choices_are_called_once_per_decision_and_give_the_mask():
     made = []
 
     def move(board, *, side):
@@ -344,7 +342,7 @@ def test_choices_are_asked_once_with_the_arguments_and_make_the_mask():
 
 
 @pytest.mark.parametrize("choices", [list, lambda: range(5)])
-def test_no_choices_and_too_many_are_errors(choices):
+def test_empty_or_too_many_choices_are_errors(choices):
     decide = decision(action_space=spaces.Discrete(4), choices=choices)
     with pytest.raises(MaskError, match="choices"):
         single_env(calling(decide), decide).reset()
@@ -383,7 +381,7 @@ def test_default_names_are_the_functions_letters_and_never_collide(points, names
     assert env.agent_selection == names[points.index(GO)]
 
 
-def test_differences_are_zero_the_first_time_in_an_episode_and_outside_of_any():
+def test_difference_is_zero_at_first_and_outside_episodes():
     count, used = [0], np.array(0.0)  # which changes in place
     change = difference(lambda: used)
 
@@ -406,6 +404,6 @@ def test_differences_are_zero_the_first_time_in_an_episode_and_outside_of_any():
     assert [outside(), outside()] == [0.0, 0.0]
 
 
-def test_difference_needs_a_callable():
+def test_difference_refuses_arguments_that_are_not_callable():
     with pytest.raises(DefinitionError):
         difference(3)

@@ -74,7 +74,7 @@ def linked(page, text):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_fits_on_it_and_the_page_says_what_it_needs(page):
+def test_page_has_short_code_lines_and_names_their_requirements(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {
@@ -244,14 +244,14 @@ def told_in_an_episode(env, seed):
     return [(turn.agent, turn.observation.tolist(), *turn[2:5]) for turn in turns]
 
 
-def test_a_hand_written_environment_and_its_successor_tell_the_same():
+def test_migrated_pettingzoo_example_matches_the_hand_written_one():
     before, after = map(run, blocks("coming-from.md", "PettingZoo"))
     told = [told_in_an_episode(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [told_in_an_episode(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
 
 
-def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
+def test_migrated_example_of_the_paper_runs(monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
     (code,) = blocks("coming-from.md", "Sim-Env")
     names = run(code)
@@ -261,7 +261,7 @@ def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
     names["env"].close()
 
 
-def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are():
+def test_problems_page_quotes_real_messages_and_errors():
     text = (DOCS / "problems.md").read_text(encoding="utf-8")
     quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
     assert len(quoted) >= 20

@@ -87,7 +87,7 @@ def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
 
 
 @pytest.mark.filterwarnings("ignore:.* override")
-def test_an_episode_without_a_decision_names_the_functions_that_override_the_point():
+def test_no_decision_error_names_functions_that_override_the_point():
     env = single_env(Derived, {CHOOSE: define()})
     with pytest.raises(
         NoDecisionError, match=rf"{CHOOSE}; .* called instead.*{__name__}\.Derived\.choose"
@@ -150,7 +150,7 @@ def test_help_explains_every_option(name):
     assert text.rstrip().count("Raises:") == 1
 
 
-def test_hints_name_what_is_close():
+def test_hints_name_the_closest_candidates():
     assert (
         did_you_mean("sheep_1", ["sheep_0", "sheep_2", "wolf_0"])
         == "; did you mean sheep_2 or sheep_0?"
@@ -181,7 +181,7 @@ def test_messages_hint_at_the_name_that_was_meant(wrong, hint):
         wrong(env)
 
 
-def test_a_name_of_a_room_is_told_by_imports_and_attributes():
+def test_import_of_a_moved_name_says_which_module_has_it():
     expected = "pad_agents is in simenv_marl.envs: from simenv_marl.envs import pad_agents"
     with pytest.raises(AttributeError, match=expected):
         print(simenv_marl.pad_agents)

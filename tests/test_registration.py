@@ -42,7 +42,7 @@ def made(identity, **options):
     return gymnasium.make(identity, **options).unwrapped
 
 
-def test_there_is_an_id_for_each_point_and_one_for_all_views_of_several_agents():
+def test_registration_gives_ids_for_points_and_multi_agent_views():
     assert [*SINGLES, JOINT, TURN, COOP] == many_registered.IDS
     assert set(many_registered.IDS[:-1]) <= set(gymnasium.registry)
     for kind, base in (("aec", pettingzoo.AECEnv), ("parallel", pettingzoo.ParallelEnv)):
@@ -64,7 +64,7 @@ def sailed(env):
     return env.simulation.boat.place
 
 
-def test_all_other_points_run_their_rule_or_the_policy_that_is_given(register):
+def test_points_outside_the_single_view_run_their_rule_or_policy(register):
     """A policy may be given under any name of the point, and then answers in every view."""
     assert -0.61 < sailed(made(SINGLES[0])) < -0.39
     assert (
@@ -82,7 +82,7 @@ def test_all_other_points_run_their_rule_or_the_policy_that_is_given(register):
         assert 0.14 < sailed(made(ids[0])) < 0.36
 
 
-def test_options_are_given_when_it_is_made():
+def test_make_of_a_registered_id_takes_options():
     env = begun(made(SINGLES[0], max_steps=1, render_mode="ansi"))
     assert env.step(RULE)[2:4] == (False, True)
     assert env.render().startswith("at ")
@@ -96,7 +96,7 @@ def test_options_are_given_when_it_is_made():
 
 
 @pytest.mark.filterwarnings("ignore:.*is out of date")  # Gymnasium's advice
-def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_versions(register):
+def test_registration_keeps_options_and_may_be_repeated_or_versioned(register):
     def length(ids, **options):
         return len(play(pettingzoo.make("aec", ids[-1], **options)))
 
@@ -117,7 +117,7 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
     assert [env.step(RULE)[3] for _ in range(2)] == [False, True]
 
 
-def test_points_are_those_that_are_named(register):
+def test_registration_has_only_the_points_that_it_is_given(register):
     steering = {
         f"{Boat.__module__}.Boat.steer_boat": define(
             action_space=spaces.Discrete(2), agent="helm_0"
@@ -161,7 +161,7 @@ def test_flatten_is_an_option_of_joint_and_turn_views_alone(register, flatten, v
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
-def test_states_stand_in_the_infos_of_joint_and_turn_views_alone(register):
+def test_state_in_info_is_an_option_of_joint_and_turn_views_only(register):
     class Charted(Voyage):
         def state(self):
             return [self.boat.place]
@@ -249,7 +249,7 @@ def test_a_refused_registration_leaves_the_registries_unchanged(register, change
     assert [dict(registry) for registry in registries] == before
 
 
-def test_in_another_process_by_module_and_id_or_by_a_spec_that_was_written_down():
+def test_registered_ids_and_specs_work_in_another_process():
     """In vectors too: spawned processes, the default outside Linux, know only the spec."""
     env = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}", max_steps=2)
     code = f"""
@@ -277,7 +277,7 @@ if __name__ == "__main__":
     ]
 
 
-def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
+def test_human_rendering_uses_rgb_arrays_of_the_simulation(register, monkeypatch):
     class Pictured(Voyage):
         render_modes = ("rgb_array",)
 

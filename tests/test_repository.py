@@ -39,7 +39,7 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     assert paper["identifiers"][0]["value"].removeprefix("arXiv:") in paper["url"]
 
 
-def test_read_the_docs_builds_what_make_docs_builds():
+def test_read_the_docs_uses_existing_configuration_and_extras():
     config = loaded(".readthedocs.yaml")
     assert (ROOT / config["sphinx"]["configuration"]).is_file()
     (install,) = config["python"]["install"]

@@ -81,7 +81,7 @@ def walked(seed, steps, **parameters):
     return model.place
 
 
-def test_with_the_rule_throughout_it_is_the_plain_model():
+def test_stepped_simulation_by_the_rule_matches_the_plain_model():
     assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(
         3, 20, drift=0.1
     )
@@ -99,7 +99,7 @@ def test_with_the_rule_throughout_it_is_the_plain_model():
 
 
 @pytest.mark.parametrize("steps", [None, 1000])
-def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
+def test_episode_ends_when_the_stepped_model_stops_running(steps):
     env = begun(aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE), 1)
     while not env.terminations["stride_0"]:
         env.step(2)
@@ -107,7 +107,7 @@ def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
     env.close()
 
 
-def test_the_seed_goes_where_the_model_takes_it():
+def test_stepped_simulation_passes_the_seed_to_the_model():
     assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
     assert simulate(SteppedSimulation(PassedOn, 5, drift=1.0), seed=2).model.place == walked(
         2, 5, drift=1.0
@@ -136,13 +136,13 @@ def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
     assert simulate(fixed, seed=2).model.place == walked(4, 5)
 
 
-def test_copies_and_pickles_run_the_same():
+def test_copied_and_pickled_stepped_simulations_run_the_same():
     simulation = SteppedSimulation(Walk, 5, drift=0.5)
     for twin in (copy.deepcopy(simulation), pickle.loads(pickle.dumps(simulation))):
         assert simulate(twin, seed=2).model.place == walked(2, 5, drift=0.5)
 
 
-def test_models_steps_and_parameters_that_cannot_be_are_refused():
+def test_stepped_simulation_refuses_invalid_arguments():
     with pytest.raises(SimulationError, match="the class of a model, not 3"):
         SteppedSimulation(3)
     for steps in (0, -1, 1.5, True, "many"):
@@ -154,7 +154,7 @@ def test_models_steps_and_parameters_that_cannot_be_are_refused():
         simulate(SteppedSimulation(Walk, 3, length=1))
 
 
-def test_points_are_those_that_are_named():
+def test_stepped_simulation_has_only_the_points_that_it_is_given():
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
     assert evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=[1]).frame[

@@ -55,7 +55,7 @@ def test_the_command_check_finds_a_written_template(tmp_path):
 
 # plain needs Stable-Baselines3: tests/clients/test_templates.py
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])
-def test_training_is_worth_something(kind, tmp_path):
+def test_template_training_beats_the_rule(kind, tmp_path):
     run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".")
     done = run(tmp_path, "-W", "error::DeprecationWarning:tank", "-m", "tank", "--quick")
     table = done.stdout.splitlines()
@@ -109,7 +109,7 @@ def test_policies_answer_one_observation_as_they_answer_many(kind):
         (["Mesa"], "cannot be the name of a module"),  # of the same file as mesa, on some systems
     ],
 )
-def test_names_that_cannot_be_used(names, told, tmp_path, capsys):
+def test_invalid_template_names_are_refused(names, told, tmp_path, capsys):
     for name in names:
         assert main(["new", "mesa", name, "--folder", str(tmp_path / "new")]) == 2
         error = capsys.readouterr().err
@@ -119,7 +119,7 @@ def test_names_that_cannot_be_used(names, told, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_classes_are_not_named_like_others(tmp_path):
+def test_template_classes_do_not_clash_with_existing_names(tmp_path):
     names = ["none", "rabbit", "box", "exception"]
     for name in names:
         assert main(["new", "mesa", name, "--folder", str(tmp_path)]) == 0
@@ -178,7 +178,7 @@ def test_infos_of_the_simpy_template_have_masks_and_elapsed_times():
     assert 0 < told["elapsed"] == told["time"] - info["time"]
 
 
-def test_nothing_is_overwritten_and_folders_may_be_out_of_reach(tmp_path, capsys):
+def test_new_command_overwrites_nothing_and_reports_bad_folders(tmp_path, capsys):
     for existing in ("tank.py", "test_tank.py"):
         folder = tmp_path / existing.removesuffix(".py")
         folder.mkdir()

@@ -72,7 +72,7 @@ def test_every_question_is_answered_and_judged_on_the_way(library, runs):
         assert np.isfinite(run["final"]["value"])
 
 
-def test_the_same_seed_comes_to_the_same_in_whatever_process(library, runs, tmp_path):
+def test_run_of_a_seed_is_the_same_in_another_process(library, runs, tmp_path):
     question = QUESTIONS[library][0]
     carry_out(library, tmp_path, questions=[question], seeds=[3], hashes="2")
     name = f"{library}-{question}-3"
@@ -80,7 +80,7 @@ def test_the_same_seed_comes_to_the_same_in_whatever_process(library, runs, tmp_
     assert found(runs, f"{library}-{question}-4")["final"] != found(runs, name)["final"]
 
 
-def test_figures_and_table_are_made_of_whatever_runs_there_are(library, runs, tmp_path):
+def test_results_are_drawn_from_the_runs_that_exist(library, runs, tmp_path):
     made = shutil.copytree(runs, tmp_path / "runs")
     baselines.main(["--episodes", "60", "--seeds", "0", "--out", str(made)])
     folders = {"data": tmp_path / "data", "figures": tmp_path / "figures"}

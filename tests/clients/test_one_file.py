@@ -11,7 +11,7 @@ from .page import DOCS
 from .returns import mean_return
 
 
-def test_the_script_of_the_page_learns(monkeypatch):
+def test_single_file_script_of_the_docs_learns(monkeypatch):
     monkeypatch.syspath_prepend(DOCS)
     with models_of_pages_forgotten():
         script = import_module("one_file")

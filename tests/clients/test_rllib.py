@@ -47,7 +47,7 @@ def _also_without_torch():
 
 
 @pytest.mark.parametrize("view", HIVES)
-def test_its_checker_finds_nothing_and_its_episodes_end_when_ours_do(view):
+def test_padded_views_pass_rllibs_checker_and_end_its_episodes(view):
     """Without padding, a death and a time limit in one step set neither flag of ``__all__``."""
     env = hive(view)
     check_multiagent_environments(env)
@@ -86,7 +86,7 @@ def hive_config(view, definition, **environment):
     )
 
 
-def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
+def test_rllib_page_trains_two_agents_and_extracts_their_policies():
     _, spaces, build, train, define, take_out = blocks("_clients_rllib.md")
     names = {"__name__": "__main__"}
     for code in (spaces, build, define):
@@ -112,7 +112,7 @@ def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
 
 
 @pytest.mark.parametrize("view", HIVES)
-def test_one_policy_for_all_who_are_born(view):
+def test_policy_shared_by_agents_that_are_born_learns(view):
     names = {"__name__": "__main__"}
     exec(blocks("_clients_rllib.md")[4], names)
     algorithm = hive_config(view, DEFINITION).build_algo()
@@ -130,7 +130,7 @@ def test_one_policy_for_all_who_are_born(view):
     algorithm.stop()
 
 
-def test_masks_are_read_from_observations():
+def test_rllib_reads_action_masks_from_observations():
     masking = RLModuleSpec(module_class=ActionMaskingTorchRLModule)
     config = hive_config("parallel", MASK_OBSERVED, disable_env_checking=True)
     algorithm = config.rl_module(rl_module_spec=masking).build_algo()

@@ -97,7 +97,7 @@ def test_sb3_accepts_the_views(make):
     env.close()
 
 
-def test_vectors_in_one_process_and_in_many_learn_the_same():
+def test_vectors_with_and_without_workers_learn_the_same():
     learnt = []
     for kind in (DummyVecEnv, SubprocVecEnv):
         envs = make_vec_env(two_bees, n_envs=2, vec_env_cls=kind)
@@ -188,7 +188,7 @@ class Deaths(BaseCallback):
 
 @pytest.mark.parametrize("seconds", [int(os.environ.get("SECONDS_OF_DEATHS", "9"))])
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="descriptors are not told of")
-def test_a_training_survives_the_deaths_of_workers(seconds):
+def test_training_survives_the_deaths_of_workers(seconds):
     def learn(kill):
         envs = Vector(
             vector_env(
@@ -257,7 +257,7 @@ def test_masks_of_a_joint_view_reach_the_policy():
     assert get_action_masks(env).tolist() == [amount > 0 for amount in nectar] + [True] * 3
 
 
-def test_the_code_of_the_page_runs(monkeypatch):
+def test_code_of_the_stable_baselines3_page_runs(monkeypatch):
     steps = page.steps("Stable-Baselines3 and sb3-contrib", monkeypatch)
     names = next(steps)
     env = single_env(names["FourWeeks"], names["points"])

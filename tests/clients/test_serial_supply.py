@@ -93,7 +93,7 @@ def test_observations_are_the_same_in_all_views():
         seen, *_ = rounds.step(actions)
 
 
-def test_discrete_orders_are_those_of_the_rule_to_half_a_unit():
+def test_discrete_actions_order_in_half_units():
     env = parallel_env(SerialSupply, DISCRETE, **OPTIONS)
     env.reset(seed=1)
     env.step(dict.fromkeys(STAGES, 9))

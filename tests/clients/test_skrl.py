@@ -11,7 +11,7 @@ from simenv_marl.envs import pad_agents
 from . import page
 
 
-def test_agents_that_are_born_and_die_are_all_there_all_the_time():
+def test_padded_view_has_all_agents_at_all_times():
     options = {"possible_agents": BEES, "state_space": "observations"}
     env = wrap_env(
         pad_agents(parallel_env(HiveSim, points(DEFINITION), **options)), wrapper="pettingzoo"
@@ -28,7 +28,7 @@ def test_agents_that_are_born_and_die_are_all_there_all_the_time():
     env.close()
 
 
-def test_the_code_of_the_page_runs(monkeypatch):
+def test_code_of_the_skrl_page_runs(monkeypatch):
     steps = page.steps("skrl", monkeypatch)
     names = next(steps)
     env, learner = names["env"], names["learners"]

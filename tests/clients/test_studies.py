@@ -37,7 +37,7 @@ def test_learner_sweep_resumes(tmp_path):
     assert told == commands.python("-m", "studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
 
 
-def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
+def test_learner_sweep_table_equals_the_one_in_the_docs(tmp_path, monkeypatch):
     (
         pytest.importorskip("optuna"),
         pytest.importorskip("seaborn"),
@@ -77,7 +77,7 @@ def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
     assert told.count("\n") == 2 + len(picture.STYLES)
 
 
-def test_bounds_plans_a_supply_chain(tmp_path, capsys):
+def test_bounds_study_plans_a_supply_chain(tmp_path, capsys):
     pytest.importorskip("stockpyl")
     from studies.bounds import serial_supply
 

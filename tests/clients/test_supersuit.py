@@ -117,7 +117,7 @@ def story_around(env):
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_wrappers_do_in_turns_and_rounds_what_they_do_around_environments_written_by_hand(name):
+def test_wrapped_views_match_a_wrapped_hand_written_environment(name):
     arguments, seen = WRAPPERS[name]
 
     def make():
@@ -184,7 +184,7 @@ def test_options_replace_wrappers():
     assert max(rewards["bee_0"] for _, rewards in by_options[1:]) == 0.5
 
 
-def test_the_code_of_the_page_runs(monkeypatch):
+def test_code_of_the_supersuit_page_runs(monkeypatch):
     (names,) = page.steps("SuperSuit", monkeypatch)
     assert names["observations"].shape == (4, 6)
     assert names["rewards"].shape == (4,)

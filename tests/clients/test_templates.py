@@ -9,7 +9,7 @@ from .commands import python
 NUMBER = re.compile(r"-?\d[\d.]*")
 
 
-def test_training_is_worth_something_and_can_be_tried_quickly(tmp_path):
+def test_template_training_beats_the_rule_and_has_a_quick_mode(tmp_path):
     write_template("plain", "tank", tmp_path)
     assert "trained " in python(tmp_path / "tank.py", "--quick")
     printed = python(tmp_path / "tank.py")

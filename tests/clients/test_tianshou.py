@@ -27,7 +27,7 @@ def greedy(algorithm):
     return act
 
 
-def test_masks_in_observations_reach_the_policy(monkeypatch):
+def test_tianshou_policy_draws_no_masked_action(monkeypatch):
     """It draws no masked action, not even to explore: that would be an error."""
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
@@ -54,7 +54,7 @@ def test_masks_in_observations_reach_the_policy(monkeypatch):
     next(steps)  # trains
 
 
-def test_agents_that_are_born_and_die():
+def test_episode_with_births_and_deaths_ends_later_if_padded():
     """Without padding an episode ends for it when the first of them dies."""
 
     def days(env):
@@ -73,7 +73,7 @@ def test_agents_that_are_born_and_die():
     assert days(PettingZooEnv(pad_agents(env))) == plain
 
 
-def test_the_code_of_the_page_runs(monkeypatch):
+def test_code_of_the_tianshou_page_runs(monkeypatch):
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
     names = next(steps)

@@ -18,7 +18,7 @@ VIEWS = {"parallel": parallel_env, "aec": aec_env}
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 
 
-def test_the_checks_of_the_page_pass():
+def test_torchrl_checks_of_the_page_pass():
     exec(blocks("_clients_torchrl.md")[0], {})
 
 
@@ -71,7 +71,7 @@ def worth(policy):
 
 
 @EVERY_VIEW
-def test_one_policy_for_all_who_are_born(view):
+def test_policy_shared_by_agents_that_are_born_learns(view):
     env = hive_torchrl.make(view)
     policy, loss = hive_torchrl.learner(env)
     before = worth(policy)

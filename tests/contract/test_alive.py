@@ -140,7 +140,7 @@ def rule_log(view, source, seed, agent=by_number):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env])
 @pytest.mark.filterwarnings("ignore:actions that no decision used")
-def test_rule_equals_the_plain_run_where_weak_sets_see_who_is_alive(view, kind):
+def test_rule_matches_the_plain_run_of_a_model_with_weak_sets(view, kind):
     source = meadow_of(kind)
     for seed in range(4):
         expected = plain_log(source, seed)
@@ -149,7 +149,7 @@ def test_rule_equals_the_plain_run_where_weak_sets_see_who_is_alive(view, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rule_equals_the_plain_run_of_one_agent_with_a_name(kind):
+def test_rule_matches_the_plain_run_of_one_named_agent(kind):
     source = meadow_of(kind)
     for seed in range(4):
         for view in (aec_env, single_env, parallel_env):
@@ -204,7 +204,7 @@ BAG = {
 
 
 @pytest.mark.parametrize("action", [RULE, 2])
-def test_items_and_choices_are_freed_with_their_call(action):
+def test_split_items_and_choices_are_freed_after_their_call(action):
     env = aec_env(Bag, BAG)
     play(env, action, seed=1)
     log = env.simulation.log
@@ -295,7 +295,7 @@ def test_an_environment_that_its_own_mapping_refers_to_is_freed(make_env):
     assert session() is None
 
 
-def test_containers_come_back_with_their_living_elements():
+def test_weakly_held_containers_keep_only_living_elements():
     from simenv_marl.core.episodes.arguments import GONE, restore, weaken
 
     living, freed = Item(1), Item(2)
@@ -346,7 +346,7 @@ class Field(SimulationInterface):
                 self.choose(cell, np.full(3, size))
 
 
-def test_arrays_among_several_arguments_are_read_again():
+def test_array_arguments_are_observed_with_their_current_values():
     given = define(
         observation_space=spaces.Box(0, 9, (3,)),
         observation_space_mapping=lambda model, cell, field: field,
@@ -381,7 +381,7 @@ def test_a_list_as_the_first_argument_is_held_weakly():
     assert simulation.unwrapped.simulation.freed == [True, True]
 
 
-def test_a_set_that_the_model_holds_is_read_as_it_stands():
+def test_set_that_the_model_keeps_is_read_with_later_changes():
     from simenv_marl.core.episodes.arguments import restore, weaken
 
     held = {Item(1)}

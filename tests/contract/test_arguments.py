@@ -133,7 +133,7 @@ class Ward(SimulationInterface):
         self.log.append(self.treat(["ada", "bob"], 5))
 
 
-def test_own_arguments_come_first_and_are_not_counted():
+def test_action_and_item_come_before_the_arguments_of_the_call():
     env = begun(
         aec_env(
             Ward,
@@ -158,7 +158,7 @@ def test_own_arguments_come_first_and_are_not_counted():
     assert env.simulation.log == [{"ada": (1, "ada", 5), "bob": (2, "bob", 5)}]
 
 
-def test_a_builtin_gets_all_arguments():
+def test_builtin_as_a_mapping_gets_all_arguments():
     env = begun(
         single_env(
             Plant,

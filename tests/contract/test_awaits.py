@@ -151,13 +151,13 @@ def test_the_rule_and_quick_policies_answer_at_once():
     assert quick[:4] == ["m0 asks", "m0 says 3", "m1 asks", "m1 says 3"]
 
 
-def test_where_a_policy_that_waits_answers_rule_the_rule_runs_then():
+def test_rule_runs_when_a_coroutine_policy_answers_rule():
     log = played(speaking(tired))
     assert log[:3] == ["m0 asks", "m1 asks", "m2 asks"]
     assert log[3:7] == ["m0 rules", "m0 says 1", "m1 rules", "m1 says 1"]
 
 
-def test_quick_policies_go_ahead_of_those_that_wait():
+def test_quick_policies_answer_before_coroutine_policies():
     log = played({"m0": counting(), "m1": lambda observation: 3})
     assert log[:7] == [
         "m0 asks",
@@ -170,7 +170,7 @@ def test_quick_policies_go_ahead_of_those_that_wait():
     ]
 
 
-def test_every_way_to_run_has_the_same_order():
+def test_all_runners_and_views_ask_in_the_same_order():
     policies = speaking(counting(lambda number: 0.003 - 0.001 * number))
     given = {"points": POINTS}
     logs = simulate_many(Council, policies, seeds=range(5), collect=log_of, concurrency=2, **given)
@@ -195,7 +195,7 @@ def test_every_way_to_run_has_the_same_order():
     env.close()
 
 
-def test_rewards_are_those_at_each_decision():
+def test_rewards_are_computed_at_each_decision():
     found = collect_episodes(Council, speaking(counting()), seeds=[1], points=POINTS)
     (data,) = found.values()
     assert data.rewards.tolist() == [8.0, 14.0, 9.0, 14.0, 10.0, 14.0]
@@ -277,7 +277,7 @@ class Timed(Restless):
 
 
 @pytest.mark.parametrize("kind", [Polling, Timed])
-def test_polls_and_timers_do_not_hinder_answers(kind):
+def test_polling_and_timed_models_get_the_answers_of_coroutines(kind):
     log = played(speaking(counting(lambda number: 0.05)), kind)
     if kind is Timed:  # its time was up while the answers came, but they were asked for first
         assert log.index("time is up") > log.index("m0 says 5")
@@ -320,7 +320,7 @@ def test_one_agent_in_two_tasks_that_wait_is_an_error():
 # -- what is asked, and how it is applied ---------------------------------------------------------
 
 
-def test_a_decision_is_shown_as_it_was_when_it_arose():
+def test_decision_of_a_coroutine_policy_keeps_its_initial_values():
     shown = []
 
     async def reader(observation, *, _decision):
@@ -379,7 +379,7 @@ def test_recordings_repeat_the_order_without_asking(many, tmp_path):
     assert run(refuse) == first
 
 
-def test_clones_and_files_in_mid_step_go_on_alike(tmp_path):
+def test_clones_and_saved_files_with_waiting_tasks_continue_alike(tmp_path):
     env = aec_env(Council, POINTS, policies=speaking(tired))
     env.reset(seed=1)
     env.step(4)
@@ -442,7 +442,7 @@ def test_an_episode_is_closed_while_tasks_wait():
 @pytest.mark.parametrize(
     ("answer", "error"), [(77, InvalidActionError), (ValueError("no"), ValueError)]
 )
-def test_the_first_wrong_answer_in_order_is_the_error(answer, error, many):
+def test_first_wrong_answer_in_order_of_asking_is_raised(answer, error, many):
     async def wrong(observation, *, _decision):
         await asyncio.sleep(0.003 if _decision.agent == "m1" else 0)
         if _decision.agent == "m0":

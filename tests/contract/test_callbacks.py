@@ -114,7 +114,7 @@ def test_after_an_error_c_gets_the_result_and_no_callback_runs():
 
 
 @pytest.mark.parametrize("during", ["step", "close"])
-def test_an_interrupt_while_c_runs_surfaces(during):
+def test_interrupt_during_c_code_surfaces(during):
     def main(simulation):
         with guard:
             loops().loop_interrupted(EACH(guard.callback(decide)), 9, 1)

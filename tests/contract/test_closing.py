@@ -82,7 +82,7 @@ def of(what):
     return [seed for kind, seed in LOG if kind == what]
 
 
-def test_close_is_called_before_the_next_reset_and_when_the_environment_is_closed():
+def test_simulation_close_runs_before_the_next_reset_and_at_env_close():
     env = begun(single_env(Shop, BOOKS), 1)
     env.step(3)
     *_, terminated, _, _ = env.step(4)
@@ -104,7 +104,7 @@ def test_close_is_called_before_the_next_reset_and_when_the_environment_is_close
 
 @pytest.mark.parametrize("shop", [Shop, Broken])
 @EVERY_VIEW
-def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error(view, shop):
+def test_dropped_environment_closes_its_simulation_and_warns_of_errors(view, shop):
     envs = [view(shop, BOOKS)]
     envs[0].reset(seed=1)
     with (
@@ -117,7 +117,7 @@ def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_vector_environments_close_each_before_it_begins_anew(mode):
+def test_vector_env_closes_each_simulation_before_its_next_reset(mode):
     env = begun(vector_env(Shop, BOOKS, num_envs=2, autoreset_mode=mode), 1)
     for _ in range(2):
         env.step(np.ones(2, np.int64))
@@ -131,7 +131,7 @@ def test_vector_environments_close_each_before_it_begins_anew(mode):
     assert len(of("close")) == len(of("reset")) == 4
 
 
-def test_runners_close_what_they_have_run_after_it_was_collected():
+def test_runners_close_each_simulation_after_collect():
     def collect(shop):
         assert shop.books is not None
         LOG.append(("collect", shop.seed))
@@ -151,7 +151,7 @@ def test_runners_close_what_they_have_run_after_it_was_collected():
     assert of("close") == of("reset") != []
 
 
-def test_its_error_does_not_take_the_place_of_an_earlier_one():
+def test_error_in_close_does_not_replace_an_earlier_error():
     for run, policies in ((simulate, {BOOK: fail}), (evaluate, {"bad": {BOOK: fail}})):
         seed = {"seed": 1} if run is simulate else {"seeds": [1]}
         with fails(LookupError, "books cannot be closed", match="first"):

@@ -206,6 +206,6 @@ SINGLES = {
 # Render modes can be tested on registered environments alone.
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes")
 @pytest.mark.parametrize("shape", SINGLES.values(), ids=SINGLES.keys())
-def test_gymnasiums_check_passes(shape):
+def test_single_views_pass_gymnasiums_check_env(shape):
     check_env(made(shape, "single"))
     check_env(made(shape, "single", "ansi"))

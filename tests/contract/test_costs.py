@@ -76,7 +76,7 @@ def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
     assert [cost for _, cost in found] == pytest.approx([reward for reward, _ in found])
 
 
-def test_a_cost_is_that_of_the_previous_action():
+def test_cost_belongs_to_the_previous_action():
     costs = iter([100, 1.5, 2.5])
     point = decision(agent="ant_0", cost_mapping=lambda: next(costs))
     env = single_env(calling(point, point), [point])

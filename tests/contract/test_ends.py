@@ -42,9 +42,7 @@ def ended_by(trigger, held):
 @EVERY_VIEW
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
-def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(
-    view, trigger, max_steps
-):
+def test_early_end_unwinds_the_model_without_answering_decisions(view, trigger, max_steps):
     log, rewarded = [], []
 
     def main(simulation):
@@ -78,7 +76,7 @@ def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decisio
     assert len(rewarded) == len(again)
 
 
-def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
+def test_exit_in_an_exception_group_unwinds_and_other_errors_surface():
     others = []
 
     def main(simulation):
@@ -112,7 +110,7 @@ def left(kind):
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
-def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
+def test_thousands_of_aborted_episodes_leak_nothing():
     draw = random.Random(5)
     driver = Options.__init__.__kwdefaults__["driver"]
     soak.play(driver, 200, draw)
@@ -129,9 +127,7 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
     "when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"]
 )
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
-def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_along(
-    view, when, where
-):
+def test_dropped_environment_unwinds_at_once_and_is_freed(view, when, where):
     def main(simulation):
         witness = Witness()
         try:
@@ -215,7 +211,7 @@ def swallow_a_few(simulation):
 @VIEWS
 @TRIGGERS
 @pytest.mark.parametrize("main", [swallow_exceptions, swallow_a_few])
-def test_models_that_resist_a_little_are_unwound(view, trigger, main):
+def test_models_that_catch_the_exit_a_few_times_are_unwound(view, trigger, main):
     before = stacks()
     held = [view(script(main), decide)]
     held[0].reset()
@@ -325,7 +321,7 @@ def wrap(decide, how):
 
 @pytest.mark.parametrize("how", ["from it", "exit", "text", "later"])
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_an_error_that_names_the_exit_as_its_cause_is_not_the_models(how, end):
+def test_error_caused_by_the_unwinding_exit_is_not_reported(how, end):
     decide = decision()
     env = begun(single_env(script(lambda simulation: wrap(decide, how)), decide))
     getattr(env, end)()

@@ -141,12 +141,12 @@ def test_environments_have_metadata_and_a_generator(view):
     ],
     ids=plainly,
 )
-def test_options_that_cannot_be_are_refused(make, options, error, match):
+def test_invalid_options_are_refused(make, options, error, match):
     with pytest.raises(error, match=match):
         make(BOTH, PUMP, **options)
 
 
-def test_views_that_cannot_be_are_refused():
+def test_invalid_views_are_refused():
     for view in ("", "AEC", 3):
         with pytest.raises(OptionValueError, match="view must be None"):
             generate_env(BOTH, PUMP, view=view)
@@ -168,7 +168,7 @@ def test_instances_may_change_the_options_of_their_class():
 # -- max_steps ------------------------------------------------------------------------------------
 
 
-def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
+def test_max_steps_count_only_legal_actions_of_the_user():
     env = begun(
         aec_env(
             calling(*[PUMP, FAN] * 5),
@@ -220,7 +220,7 @@ def first_legal(observation, info=None):
         (len, 2),
     ],
 )
-def test_policies_are_callables_of_the_observation_or_of_observation_and_info(policy, answer):
+def test_policies_take_the_observation_or_observation_and_info(policy, answer):
     masks = {"action_mask_mapping": lambda: [0] * 3 + [1] * 7} if answer == 3 else {}
     decide = decision(agent="decider_0", **masks)
     env = aec_env(calling(decide, PUMP), [decide, PUMP], policies={"decider_0": policy})
@@ -239,7 +239,7 @@ def test_a_policys_action_is_checked_and_mapped():
     env.reset()
 
 
-def test_policies_of_agents_that_a_callable_names_by_any_name():
+def test_policies_may_be_given_for_agents_that_a_callable_names():
     calls = calling(
         *[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "herd.1", "c")]
     )
@@ -251,7 +251,7 @@ def test_policies_of_agents_that_a_callable_names_by_any_name():
 # -- agents ---------------------------------------------------------------------------------------
 
 
-def test_points_of_one_agent_have_equal_spaces_and_one_policy():
+def test_points_of_one_agent_must_have_equal_spaces_and_one_policy():
     few = {"agent": lambda: "pump_0", "action_space": spaces.Discrete(3)}
     named, other = decision(**few), decision(agent=lambda: "pump_0")
     for first, second in ((PUMP, named), (named, other)):

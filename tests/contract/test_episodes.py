@@ -153,7 +153,7 @@ def test_observations_are_computed_at_each_decision_and_at_the_end():
     assert ended == {"being_0": ([0, 6], 6.0), "being_1": ([1, 5], 5.0), "being_2": ([2, 0], 0.0)}
 
 
-def test_before_its_first_decision_an_agent_observes_a_blank():
+def test_agent_observes_values_nearest_zero_before_its_first_decision():
     dials = spaces.MultiDiscrete([2, 2], start=[-5, -1])
     parts = spaces.Tuple([dials, spaces.MultiBinary(2)])
     space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9), c=parts)
@@ -224,7 +224,7 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
     ids=str,
 )
 @VIEWS
-def test_rule_and_whatever_is_sampled_are_actions(view, space):
+def test_rule_and_samples_of_the_space_are_legal_actions(view, space):
     decide = decision(action_space=space, agent="a_0", action_space_mapping=lambda action: "sample")
     env = begun(view(calling(*[decide] * 6), decide), 1)
     env.step(RULE)
@@ -293,9 +293,7 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
     ids=str,
 )
 @VIEWS
-def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
-    view, space, legal, illegal
-):
+def test_illegal_actions_raise_and_leave_the_environment_unchanged(view, space, legal, illegal):
     moved = []
     decide = decision(
         action_space=space,

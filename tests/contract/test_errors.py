@@ -78,7 +78,7 @@ def test_all_errors_are_public_survive_pickling_and_have_one_root():
 
 
 @pytest.mark.parametrize("view", [aec_env, single_env])
-def test_use_before_reset_after_the_end_and_after_close_are_errors_of_their_own(view):
+def test_use_before_reset_after_the_end_or_after_close_is_refused(view):
     def refuses(kind, match, *uses):
         for use in (*uses, *uses):
             with pytest.raises(kind, match=match):
@@ -136,7 +136,7 @@ def test_the_model_may_catch_the_errors_of_its_own_rule_and_of_apply(action):
 @pytest.mark.greenlet("threads of their own may be used from any other")
 @EVERY_VIEW
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_nothing(what, view):
+def test_environment_refuses_use_from_another_thread_and_stays_intact(what, view):
     unwound = []
 
     def main(simulation):
@@ -206,13 +206,13 @@ unwieldy = pytest.mark.parametrize("make", UNWIELDY.values(), ids=UNWIELDY)
 
 
 @unwieldy
-def test_any_value_is_shown_in_short(make):
+def test_short_repr_limits_the_length_of_any_value(make):
     assert 0 < len(short_repr(make())) <= LONGEST
     assert len(short_repr(make(), 60)) <= 60
     short_repr(make()).encode()
 
 
-def test_short_values_and_errors_are_shown_as_they_are():
+def test_short_repr_leaves_short_values_and_errors_unchanged():
     for value in (
         1.5,
         "text",
@@ -228,7 +228,7 @@ def test_short_values_and_errors_are_shown_as_they_are():
 
 @unwieldy
 @EVERY_VIEW
-def test_an_action_that_is_none_is_refused_in_short_whatever_it_looks_like(view, make):
+def test_error_for_an_unwieldy_action_is_short(view, make):
     decide = decision(action_space=spaces.MultiDiscrete([3, 3]))
     env = begun(view(calling(decide), decide), 1)
     with pytest.raises(InvalidActionError) as caught:
@@ -258,7 +258,7 @@ def test_invalid_results_of_mappings_are_refused_with_short_messages(name, error
 
 
 @pytest.mark.usefixtures("_collected")
-def test_an_error_without_looks_is_no_obstacle_to_the_first_one():
+def test_error_without_a_repr_does_not_hide_the_first_error():
     """It is raised while the simulation is unwound for another."""
 
     def main(simulation):
@@ -274,7 +274,7 @@ def test_an_error_without_looks_is_no_obstacle_to_the_first_one():
 
 
 @pytest.mark.parametrize("given", ["text", 3, None, ("one",), {}, [3], Broken()])
-def test_an_error_stays_itself_whatever_is_in_the_place_of_its_notes(given):
+def test_error_with_malformed_notes_surfaces_unchanged(given):
     def fail(*_):
         error.__notes__ = given
         raise error

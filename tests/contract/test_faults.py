@@ -88,7 +88,7 @@ def play_and_cut_short(env):
 
 
 @everywhere(*VIEWS)
-def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
+def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
     before = stacks()
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
@@ -151,9 +151,7 @@ def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
     ],
 )
 @pytest.mark.parametrize("seed", [31, None])  # None: it is drawn
-def test_one_note_says_at_which_decision_of_whom_it_was_and_the_seed(
-    view, place, time, where, seed
-):
+def test_error_note_names_decision_agent_and_seed(view, place, time, where, seed):
     env, farm = farm_env(view, place)
     farm.let(partial(throw, ValueError("told")), place, time)
     with pytest.raises(ValueError, match="told") as caught:
@@ -175,7 +173,7 @@ INSIDE = [place for place in farms.PLACES if place != "render"]  # which comes a
 
 @everywhere(*VIEWS, farms.vector, farms.vector_of_joint, places=INSIDE)
 @pytest.mark.parametrize("method", ["step", "reset", "close"])
-def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view, place, method):
+def test_reentrant_use_is_refused_and_the_episode_continues(view, place, method):
     def use():
         take(env, 0) if method == "step" else getattr(env, method)()
 
@@ -317,7 +315,7 @@ USES = {
 
 @pytest.mark.greenlet("the release is the same with every driver")
 @pytest.mark.parametrize("use", USES)
-def test_an_interrupt_anywhere_in_what_opens_and_closes_leaves_nothing_patched(use):
+def test_interrupt_while_opening_or_closing_leaves_nothing_patched(use):
     alone(interrupt_what_opens_and_closes, use)  # as above
 
 

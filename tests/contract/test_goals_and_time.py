@@ -151,14 +151,14 @@ def test_rewards_are_computed_anew_for_other_goals():
         ({"compute_reward": 3}, "compute_reward must be callable"),
     ],
 )
-def test_goals_need_all_of_their_parts_and_are_in_their_space(changes, match):
+def test_incomplete_goals_and_goals_outside_their_space_are_refused(changes, match):
     with pytest.raises(DefinitionError, match=match):
         goals(**changes)
     with pytest.raises(ObservationError, match="its space Box"):
         single_env(Walk, goals(achieved_goal_mapping=lambda walk, pace: [1, 2, 3])).reset()
 
 
-def test_masks_stay_where_they_belong_beside_goals():
+def test_goal_observations_keep_the_action_mask_in_observation_and_info():
     changes = {
         "action_space": spaces.Discrete(3),
         "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
@@ -261,7 +261,7 @@ def test_masked_actions_are_illegal_in_every_view(view, changes, mask, illegal, 
     assert env.simulation.log == log
 
 
-def test_a_mask_that_the_model_itself_observes_is_no_mask_of_its_decisions():
+def test_action_mask_in_the_models_observation_does_not_mask_actions():
     space = spaces.Dict({"action_mask": spaces.MultiBinary(10)})
     own = {
         "observation_space": space,
@@ -301,7 +301,7 @@ def times(turns, agent):
     return [(turn.info["time"], turn.info["elapsed"]) for turn in turns if turn.agent == agent]
 
 
-def test_the_time_of_the_announced_and_of_the_dead():
+def test_infos_of_expected_and_of_ended_agents_have_their_times():
     program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
     env = begun(
         aec_env(
@@ -344,7 +344,7 @@ def test_rounds_have_the_time_of_the_simulation():
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_know_the_time_how_much_has_gone_by_and_its_discount(action):
+def test_policies_get_time_elapsed_and_discount_in_infos(action):
     """Since the decision before, whether the policy has taken that or left it to the rule."""
     ant, seen = decision(agent="ant_0"), []
 
@@ -374,7 +374,7 @@ def told(env):
 
 @EVERY_VIEW
 @pytest.mark.parametrize("rate", [0.25, 0, None])
-def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(view, rate):
+def test_infos_have_time_elapsed_and_discount_in_every_view(view, rate):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
     env = view(clock, ant, discount_rate=rate)
@@ -392,7 +392,7 @@ def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discou
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
-def test_rates_that_do_not_discount_are_refused(rate):
+def test_invalid_discount_rates_are_refused(rate):
     with pytest.raises(
         OptionValueError,
         match="discount_rate must be a finite number that is not negative, or None",
@@ -431,7 +431,7 @@ def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
     assert all(info.keys() == expected[agent] for agent, info in infos.items())
 
 
-def test_everything_is_legal_for_those_who_have_not_decided_yet():
+def test_action_mask_is_open_before_the_first_decision_of_an_agent():
     ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
     env = begun(aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk]))
     env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
@@ -446,7 +446,7 @@ def test_everything_is_legal_for_those_who_have_not_decided_yet():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_a_mask_in_an_observation_without_a_decision_is_open(make):
+def test_mask_in_an_observation_without_a_decision_is_all_ones(make):
     """A mask of zeros would leave a policy nothing to choose from."""
     seen = spaces.Dict(
         observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10)
@@ -507,7 +507,7 @@ class Ragged(Counted):
 
 
 @EVERY_VIEW
-def test_the_state_is_a_copy_of_the_simulations_in_its_space(view):
+def test_env_state_is_a_copy_of_the_simulation_state_cast_to_its_space(view):
     ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
     env = view(lambda: Counted(ant), ant)
     assert env.state_space is None
@@ -526,7 +526,7 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(view):
     assert env.state() in env.state_space
 
 
-def test_states_that_cannot_be_are_refused():
+def test_invalid_states_are_refused():
     ant = decision(agent="ant_0")
     for make, options, error, match in (
         (
@@ -551,7 +551,7 @@ def test_states_that_cannot_be_are_refused():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_the_state_may_be_what_all_observe(make):
+def test_state_may_be_the_concatenated_observations(make):
     ant = decision(agent="ant_0", observation_space=spaces.Box(0, 9, (2,), np.float32))
     bee = decision(
         agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 2
@@ -583,7 +583,7 @@ def test_the_state_may_be_what_all_observe(make):
 
 
 @EVERY_VIEW
-def test_the_simulation_renders_in_its_modes(view, capsys):
+def test_render_returns_frames_of_the_simulation_in_its_modes(view, capsys):
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
         view(lambda: Counted(ant), ant, render_mode=mode)
@@ -629,7 +629,7 @@ def first_numbers(frames):
 
 
 @pytest.mark.parametrize("registered_as", ["a simulation", "a function"])
-def test_lists_of_pictures_have_those_since_the_last_reset_or_render(registered_as):
+def test_rgb_array_list_has_frames_since_the_last_reset_or_render(registered_as):
     ant = decision(agent="ant_0")
     with registries_put_back():
         if registered_as == "a simulation":

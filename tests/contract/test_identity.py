@@ -55,7 +55,7 @@ def made(view, design, **options):
 
 @given(designs, seeds, OPTIONS)
 @settings(max_examples=150)
-def test_with_rule_throughout_every_view_is_the_plain_run(design, seed, options):
+def test_every_view_stepped_with_rule_matches_the_plain_run(design, seed, options):
     expected = outcome(plain(design, seed))
     for view in VIEWS:
         env = made(view, design, **options)
@@ -158,9 +158,7 @@ uses = st.lists(
 
 @given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
 @settings(max_examples=120)
-def test_whatever_is_done_with_some_environments_each_is_as_if_it_were_alone(
-    design, kinds, sequence
-):
+def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:
         player = players[which]

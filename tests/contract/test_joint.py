@@ -38,7 +38,7 @@ BOX = {
 # -- dicts ----------------------------------------------------------------------------------------
 
 
-def test_spaces_are_dicts_keyed_by_agent():
+def test_joint_spaces_are_dicts_keyed_by_agent():
     ant, bee, cat = points(
         3, action_space=spaces.Discrete(10), observation_space=spaces.Box(-9, 9, (2,))
     )
@@ -60,7 +60,7 @@ def test_spaces_are_dicts_keyed_by_agent():
     assert env.simulation.log == [1, 7, 2]
 
 
-def test_an_action_that_is_illegal_by_its_turn_counts_as_missing_and_infos_have_the_masks_of_all():
+def test_joint_action_illegal_at_its_turn_counts_as_missing():
     mask = np.array([1] * 3 + [0] * 7, np.int8)
     ant, cat = decision(agent="ant_0", action_mask_mapping=lambda: mask), decision(agent="cat_0")
     bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
@@ -78,7 +78,7 @@ def test_an_action_that_is_illegal_by_its_turn_counts_as_missing_and_infos_have_
 
 
 @pytest.mark.parametrize("max_steps", [None, 2])
-def test_a_step_is_a_round(max_steps):
+def test_joint_step_answers_one_decision_of_each_agent(max_steps):
     ant, bee = points(reward_mapping=lambda: 1.5)
     calls = [ant, bee] * (2 if max_steps is None else 9)
     env = joint_env(calling(*calls), [ant, bee], max_steps=max_steps)
@@ -116,7 +116,7 @@ def test_a_step_is_a_round(max_steps):
     ],
     ids=repr,
 )
-def test_actions_that_are_refused_move_nothing(flatten, action, match):
+def test_refused_joint_action_leaves_the_environment_unchanged(flatten, action, match):
     paid, seen = [], []
     changes = BOX | {"action_space_mapping": lambda action: seen.append(action) or float(action[0])}
     ant, bee = points(reward_mapping=lambda: paid.append(0) or 1.0, **changes)
@@ -162,7 +162,7 @@ def test_the_roster_is_declared_or_asked_of_the_simulation():
         assert {name: part.tolist() for name, part in observation.items()} == seen
 
 
-def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
+def test_ended_agents_keep_their_last_observation_and_get_no_reward():
     env = joint_env(life(PACK, announced=range(3)), beings())
     env.reset()
     action = {"being_0": 5, "being_1": 6, "being_2": 7}
@@ -293,7 +293,7 @@ def test_flattened_discrete_spaces_have_one_mask():
     ],
     ids=["matrix of numbers", "matrix", "bits"],
 )
-def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
+def test_flatten_refuses_unsuitable_spaces_and_views(of_ant, of_bee, match):
     ant, bee = decision(agent="ant_0", **of_ant), decision(agent="bee_0", **of_bee)
     with pytest.raises(ViewError, match=match):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
@@ -302,7 +302,7 @@ def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
             make(calling(ant, bee), [ant, bee], flatten=True)
 
 
-def test_a_number_beside_a_vector_is_the_largest_legal_preference():
+def test_flattened_discrete_action_is_the_largest_legal_preference():
     mask = np.array([0, 1, 1], np.int8)
     ant = decision(
         agent="ant_0",
@@ -335,7 +335,7 @@ def test_a_number_beside_a_vector_is_the_largest_legal_preference():
     ],
     ids=["deaths and a roster", "flattened"],
 )
-def test_gymnasiums_check_passes(make):
+def test_joint_view_passes_gymnasiums_check_env(make):
     env = make()
     check_env(env, skip_render_check=True)
     drawn = []

@@ -117,7 +117,7 @@ def test_a_simulation_without_a_limit_of_steps_runs_to_its_end():
     assert env.simulation.years == 1000
 
 
-def test_an_apply_that_calls_its_function_reports_no_action_of_the_rule():
+def test_apply_that_runs_the_rule_sets_no_rule_action_in_info():
     fill = decision(lambda: 3, apply=lambda action: fill() + action, rule_action_mapping=int)
     env = begun(single_env(calling(*[fill] * 4), fill))
     infos = [env.step(action)[4] for action in (1, RULE, 2)]

@@ -126,7 +126,7 @@ HANGS = {"loop": loop, "swallow errors": swallow_errors}
 @FORKS
 @pytest.mark.parametrize("hang", HANGS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_a_step_that_loops_for_ever_ends_with_the_models_stack(view, hang):
+def test_step_that_hangs_raises_step_timeout_with_the_models_stack(view, hang):
     before = set(threading.enumerate())
     env, step = limited(view)
     env.reset(seed=4, options={"how": HANGS[hang]})
@@ -153,7 +153,7 @@ def test_a_step_that_loops_for_ever_ends_with_the_models_stack(view, hang):
     assert set(threading.enumerate()) <= before
 
 
-def test_a_model_unwinds_and_its_finally_blocks_run():
+def test_timed_out_model_unwinds_and_runs_its_finally_blocks():
     env, step = limited()
     env.reset(options={"how": loop})
     with pytest.raises(StepTimeoutError):
@@ -162,7 +162,7 @@ def test_a_model_unwinds_and_its_finally_blocks_run():
 
 
 @pytest.mark.parametrize("where", ["reset", "user"])
-def test_resets_and_the_time_of_the_user_have_no_limit(where):
+def test_step_timeout_excludes_reset_and_the_users_own_time(where):
     class Slow(Machine):
         def reset(self, seed=None, options=None):
             time.sleep(2 * LIMIT if where == "reset" else 0)
@@ -177,7 +177,7 @@ def test_resets_and_the_time_of_the_user_have_no_limit(where):
             env.step(1)
 
 
-def test_results_are_those_without_a_limit():
+def test_step_timeout_does_not_change_results():
     logs = []
     for limit in (None, 30, 0.5):
         env, step = limited(step_timeout=limit)
@@ -209,7 +209,7 @@ def test_a_model_that_never_unwinds_is_given_up(monkeypatch):
     time.sleep(max(ends - time.monotonic(), 0) + 0.2)  # threads end
 
 
-def test_a_slow_error_is_still_that_error():
+def test_step_timeout_does_not_replace_an_error_raised_in_time():
     def fail(seconds):
         try:
             raise KeyError("mine")
@@ -223,7 +223,7 @@ def test_a_slow_error_is_still_that_error():
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_tasks_of_an_event_loop_end():
+def test_step_timeout_ends_tasks_of_an_event_loop():
     env, step = limited()
     env.reset(options={"how": lambda seconds: asyncio.run(wait(1))})
     with pytest.raises(StepTimeoutError) as caught:
@@ -233,7 +233,7 @@ def test_tasks_of_an_event_loop_end():
     step(1)
 
 
-def test_other_options_are_refused():
+def test_invalid_step_timeouts_are_refused():
     for wrong in (0, -1, float("inf"), "1", True):
         with pytest.raises(OptionValueError, match="step_timeout must be a positive number"):
             limited(step_timeout=wrong)
@@ -242,7 +242,7 @@ def test_other_options_are_refused():
             run(Machine, step_timeout=1)
 
 
-def test_an_episode_that_took_too_long_is_a_file_up_to_there(tmp_path):
+def test_episode_that_timed_out_can_be_saved(tmp_path):
     env, step = limited()
     env.reset(seed=3)
     step(1)
@@ -253,7 +253,7 @@ def test_an_episode_that_took_too_long_is_a_file_up_to_there(tmp_path):
 
 
 @pytest.mark.parametrize("view", [view for view in VIEWS if view != "workers"])
-def test_a_limit_may_end_a_step_at_any_moment(view):
+def test_step_timeout_may_interrupt_a_step_at_any_moment(view):
     before = set(threading.enumerate())
     random, late = Random(0), 0
     for seed in range(40):
@@ -278,7 +278,7 @@ def test_a_limit_may_end_a_step_at_any_moment(view):
 
 @ALARMS
 @pytest.mark.parametrize("view", VIEWS)
-def test_greenlets_outside_the_main_thread_are_refused(view):
+def test_step_timeout_outside_the_main_thread_needs_the_thread_driver(view):
     if view == "workers":
         pytest.skip("workers have main threads")
     env, _ = limited(view)
@@ -287,7 +287,7 @@ def test_greenlets_outside_the_main_thread_are_refused(view):
     env.close()
 
 
-def test_threads_have_limits_in_any_thread():
+def test_step_timeout_works_in_any_thread_with_the_thread_driver():
     def play():
         env, step = limited(driver="thread")
         env.reset(options={"how": loop})
@@ -378,7 +378,7 @@ def test_a_model_may_have_an_alarm_of_its_own():
 
 
 @ALARMS
-def test_a_mapping_that_takes_too_long_ends_as_well():
+def test_step_timeout_interrupts_a_slow_mapping():
     before = stacks()
     choose = decision(agent="ant", observation_space_mapping=lambda: [loop(len(slow)) or 0, 0])
     slow = []
@@ -399,7 +399,7 @@ def test_a_mapping_that_takes_too_long_ends_as_well():
 
 @ALARMS
 @pytest.mark.parametrize(("inner", "outer"), [(0.1, 5), (5, 0.1), (None, 0.1)])
-def test_the_shorter_limit_of_two_environments_holds(inner, outer):
+def test_shorter_step_timeout_of_nested_environments_applies(inner, outer):
     before = stacks()
     within, step = limited(step_timeout=inner)
     seen = []
@@ -425,7 +425,7 @@ def test_the_shorter_limit_of_two_environments_holds(inner, outer):
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_clones_have_the_limit_too(method, request):
+def test_clones_keep_the_step_timeout(method, request):
     if method == "fork" and request.node.callspec.params["_driver"] == "thread":
         pytest.skip("threads are not forked")
     env, step = limited()

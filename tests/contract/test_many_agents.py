@@ -112,7 +112,7 @@ def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
     ]
 
 
-def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
+def test_spaces_of_agents_that_join_late_are_separate_and_seeded():
     def drawn(env, seed):
         env.reset(seed=seed)
         env.step(1)
@@ -191,7 +191,7 @@ def test_a_roster_is_declared_by_point_where_there_are_several():
         ),
     ],
 )
-def test_rosters_that_cannot_be_are_refused(options, error, match):
+def test_invalid_rosters_are_refused(options, error, match):
     with pytest.raises(error, match=match):
         aec_env(life("0 acts"), **{"points": beings()} | options)
 
@@ -219,7 +219,7 @@ def test_an_undeclared_agent_may_follow_its_rule():
 # -- who is expected ------------------------------------------------------------------------------
 
 
-def test_announced_agents_join_and_are_observed_before_their_first_decision():
+def test_expected_agents_join_and_observe_before_their_first_decision():
     paid = []
     definition = beings(reward_mapping=lambda being: paid.append(being.number) or 0.0)
     env = begun(aec_env(life(IN_ORDER, announced=[0, 1, 2, 2, 0]), definition))
@@ -255,7 +255,7 @@ def test_announced_agents_join_and_are_observed_before_their_first_decision():
     ],
     ids=["nobody's agent", "a policy's agent", "an undeclared agent"],
 )
-def test_those_who_are_announced_join_if_their_decisions_are_the_users(
+def test_expected_agents_join_only_if_the_user_decides_for_them(
     announced, changes, options, agents, log
 ):
     env = begun(aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options))
@@ -264,7 +264,7 @@ def test_those_who_are_announced_join_if_their_decisions_are_the_users(
     assert env.simulation.log == log
 
 
-def test_announced_agents_that_never_decide_end_with_the_episode():
+def test_expected_agents_that_never_decide_end_with_the_episode():
     program = life("0 acts, 2 health 8, 2 leaves, 1 acts, 3 health 4", announced=[1, 2, 3])
     turns = play(aec_env(program, beings()), 1)
     assert story(turns) == "0 2+ 1 0+ 1+ 3+"
@@ -273,7 +273,7 @@ def test_announced_agents_that_never_decide_end_with_the_episode():
     assert turns[-1].observation.tolist() == [3, 4]  # observed anew on the call that was to come
 
 
-def test_of_several_announced_calls_of_an_agent_the_first_one_is_observed():
+def test_first_expected_call_of_an_agent_is_the_one_observed():
     named = beings(agent=lambda being: "late" if being.number else "early")
     env = begun(aec_env(life("0 acts, 4 acts", announced=[4, 3, 0]), named))
     assert env.observe("late").tolist() == [4, 0]
@@ -459,7 +459,7 @@ def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
         ("tests.worlds.many_worlds.Being.act", DefinitionError, "Being.act"),
     ],
 )
-def test_removals_that_cannot_be_are_refused(removed_by, error, match):
+def test_invalid_removals_are_refused(removed_by, error, match):
     with pytest.raises(error, match=match):
         aec_env(life("0 acts"), beings(removed_by=removed_by))
     assert Being(0).act() == "rule"
@@ -493,7 +493,7 @@ def test_the_single_view_ends_with_its_agent_and_the_simulation_runs_on():
         ("0 acts, 1 acts, 0 leaves, 0 fails", "being_1"),
     ],
 )
-def test_an_error_at_an_end_says_whose_it_was(program, whose):
+def test_error_at_the_end_of_an_agent_names_the_agent(program, whose):
     env = begun(
         aec_env(life(program), beings(reward_mapping=lambda being: 1 / (being.health + 1))), 19
     )
@@ -539,7 +539,7 @@ BY_NAME = beings(removed_by=())
 
 
 @pytest.mark.filterwarnings("ignore:end_agent.'being_7'. has no effect")
-def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_leaves():
+def test_end_agent_gives_a_last_reward_and_observation():
     program = (
         "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
     )
@@ -572,7 +572,7 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 @given(designs, seeds)
 @settings(max_examples=120)
-def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
+def test_random_colony_in_the_aec_view_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     if not plain.decisions:
         return

@@ -139,7 +139,7 @@ def episode(env):
     [(None, [1, 3, 1, 2, 1, 1]), ({"player_blue": lambda observation: 0}, [1] * 6)],
     ids=["their rule", "policies"],
 )
-def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves):
+def test_agent_option_asks_one_agent_and_leaves_others_to_policies(policies, moves):
     env = single_env(Game, MOVE, agent="player_red", policies=policies)
     steps, offers = episode(env)
     assert offers == [1, 3, 1, 2, 1, 1]
@@ -150,7 +150,7 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves):
         env.step(0)
 
 
-def test_an_agent_with_a_name_of_its_own_is_one_of_several_points():
+def test_agent_with_a_fixed_name_can_be_chosen_among_several_points():
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
     env = begun(
         single_env(
@@ -167,7 +167,7 @@ def test_an_agent_with_a_name_of_its_own_is_one_of_several_points():
     assert env.simulation.log == [(5, 1), (5, 1)]
 
 
-def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs():
+def test_possible_agents_by_point_assign_agents_to_points():
     named = {
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
@@ -180,7 +180,7 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs():
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did():
+def test_episode_without_the_agent_raises_error_listing_other_agents():
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
@@ -235,14 +235,14 @@ def simulated(simulation, points, **options):
         ),
     ],
 )
-def test_only_the_single_view_takes_an_agent_and_needs_one_of_many(
+def test_invalid_uses_of_the_agent_option_are_refused(
     make, simulation, points, options, error, match
 ):
     with pytest.raises(error, match=match):
         make(simulation, points, **options)
 
 
-def test_all_that_makes_single_views_takes_the_name_of_the_agent():
+def test_agent_option_works_wherever_single_views_are_made():
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
@@ -270,7 +270,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up():
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_forced_moves_ask_neither_the_user_nor_a_policy():
+def test_skip_forced_asks_neither_the_user_nor_a_policy():
     asked = []
 
     def policy(observation, info):
@@ -293,7 +293,7 @@ def test_forced_moves_ask_neither_the_user_nor_a_policy():
     assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
-def test_in_rounds_forced_moves_use_no_action():
+def test_forced_moves_in_rounds_consume_no_action():
     env, joint = parallel_env(Game, MOVE, **ROSTER), joint_env(Game, MOVE, **ROSTER)
     env.reset(seed=0)
     joint.reset(seed=0)
@@ -324,7 +324,7 @@ def test_in_rounds_forced_moves_use_no_action():
     ],
     ids=["a space of one action", "several parts"],
 )
-def test_there_are_forced_moves_without_choices(changes, asked, moves):
+def test_skip_forced_works_with_masks_instead_of_choices(changes, asked, moves):
     points = {f"{PLACE}.move": definition(choices=None, **changes)}
     env = begun(single_env(Game, points, agent="player_red", skip_forced=True), 0)
     for action in asked:
@@ -332,7 +332,7 @@ def test_there_are_forced_moves_without_choices(changes, asked, moves):
     assert moves_of(env, "player_red") == moves
 
 
-def test_an_episode_of_forced_moves_alone_ends_at_the_first_step():
+def test_episode_with_only_forced_moves_ends_at_the_first_step():
     env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
     for _ in range(2):
         observation, _ = env.reset(seed=0)
@@ -438,7 +438,7 @@ def test_the_vector_view_clips_as_the_single_view_does():
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round():
+def test_rewards_of_agents_ended_during_reset_come_with_the_first_step():
     """The first being has no choice and is out before the second one is asked."""
     program = (
         "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2,"
@@ -464,7 +464,7 @@ def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or
 
 
 @pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
-def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies):
+def test_single_view_ends_with_its_agent_even_if_others_go_on(policies):
     program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
     env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):

@@ -63,7 +63,7 @@ def test_observations_do_not_show_the_moves_of_the_same_round():
     assert env.agents == []
 
 
-def test_a_round_answers_a_decision_within_a_decision():
+def test_parallel_step_answers_nested_decisions():
     inner = decision(agent="inner_0")
     outer = decision(lambda: inner() + 1, agent="outer_0")
     env = parallel_env(calling(outer), [outer, inner])
@@ -95,7 +95,7 @@ def play_rounds(env, share, rounds=10):
 
 
 @pytest.mark.filterwarnings("error")
-def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
+def test_episode_end_warns_once_of_the_number_of_lost_actions():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def main(simulation):
@@ -137,7 +137,7 @@ def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
     ],
     ids=repr,
 )
-def test_actions_that_are_refused_move_nothing(actions, error, match):
+def test_refused_round_leaves_the_environment_unchanged(actions, error, match):
     calls = []
     ant, bee = (
         decision(agent=name, reward_mapping=lambda: calls.append(0) or 1.0)
@@ -156,7 +156,7 @@ def test_actions_that_are_refused_move_nothing(actions, error, match):
 
 
 @pytest.mark.parametrize("padded", [False, True])
-def test_a_step_without_actions_after_the_end_brings_nothing(padded):
+def test_empty_step_after_the_end_returns_empty_dicts(padded):
     """PettingZoo's own environments do so, and wrappers rely on it."""
     ant = decision(agent="ant_0")
     env = parallel_env(calling(ant), ant)
@@ -178,7 +178,7 @@ def test_a_step_without_actions_after_the_end_brings_nothing(padded):
     assert env.agents == []
 
 
-def test_choices_may_be_used_up_at_the_end():
+def test_choices_may_be_empty_at_the_end():
     left = ["axe", "bow"]
     ant = decision(agent="ant_0", choices=lambda: left, action_space=spaces.Discrete(2))
 
@@ -365,7 +365,7 @@ class Rounds:
 )
 @settings(max_examples=150)
 @pytest.mark.filterwarnings("ignore:.*agents that did not appear")
-def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
+def test_random_rounds_match_a_reference_implementation(program, seed, max_steps, data):
     env = parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
     env.simulation.program = program
     reference = Rounds(program, seed, max_steps)
@@ -449,7 +449,7 @@ def played(env, seed, in_turns):
 
 @given(designs, seeds)
 @settings(max_examples=60)
-def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
+def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
     for simulation, roster, in_turns in (

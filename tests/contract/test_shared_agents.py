@@ -87,7 +87,7 @@ class Announcing(Ward):
         return [(nurse,) for nurse in self.nurses]
 
 
-def test_who_is_announced_at_another_point_decides_where_it_is():
+def test_agent_expected_at_one_point_may_decide_at_another():
     shifted = points(action_space_mapping=lambda action: action + 1)
     env = aec_env(Announcing, shifted)
     play(env, 0)
@@ -143,7 +143,7 @@ def test_different_spaces_need_the_turn_view():
     assert total == 10.0
 
 
-def test_the_state_has_one_part_for_an_agent_with_two_kinds_of_observations():
+def test_state_has_one_part_per_agent_with_two_kinds_of_observations():
     make = points(observation_space=spaces.Discrete(3), observation_space_mapping=lambda nurse: 2)
     names = {point: ["ann", "bob"] for point in make}
     given = {"possible_agents": names, "state_space": "observations", "state_in_info": True}
@@ -223,7 +223,7 @@ def test_a_single_view_waits_for_an_episode_in_which_its_agent_is_born():
         never.reset(seed=0)
 
 
-def test_a_deterministic_simulation_is_not_tried_again(monkeypatch):
+def test_deterministic_simulation_is_not_reset_with_further_seeds(monkeypatch):
     monkeypatch.setattr(Colony, "deterministic", True, raising=False)
     env = single_env(Colony, ANTS, agent="ant_1")
     with pytest.raises(NoDecisionError):

@@ -81,7 +81,7 @@ def test_errors_pass_through_environments_that_are_nested_deeply():
     env.step(1)
 
 
-def test_a_suspended_nest_is_collected():
+def test_nested_environments_in_mid_episode_are_unwound_when_dropped():
     before, unwound, outer = stacks(), [], decision(agent="outer_0")
 
     def main(simulation):
@@ -178,7 +178,7 @@ def test_greenlets_of_the_model_may_decide_and_unwind(how):
 # -- asyncio --------------------------------------------------------------------------------------
 
 
-def test_models_that_use_asyncio_run_side_by_side_whatever_is_decided_in_each():
+def test_interleaved_asyncio_models_do_not_affect_each_other():
     """Clerks work concurrently on one event loop; each decides how many rounds a task takes."""
 
     async def few(number):

@@ -34,7 +34,7 @@ from tests.worlds.models import calling, decision, script
 from tests.worlds.undone import fails
 
 
-def test_without_policies_it_is_the_plain_run_of_a_copy():
+def test_simulate_without_policies_is_the_plain_run_of_a_copy():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     # and lists it
     assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]
@@ -46,7 +46,7 @@ def test_without_policies_it_is_the_plain_run_of_a_copy():
         assert not hasattr(given_simulation, "log")
 
 
-def test_a_seed_is_handed_on_or_drawn():
+def test_simulate_passes_its_seed_on_or_draws_one():
     ant = decision(agent="ant_0")
     assert simulate(calling(ant), seed=7).seed == 7
     drawn = {simulate(calling(ant)).seed for _ in range(5)} | {
@@ -61,7 +61,7 @@ def test_a_seed_is_handed_on_or_drawn():
 ANT = decision(agent="ant_0")
 
 
-def test_errors_name_the_seed():
+def test_errors_in_simulate_name_the_seed():
     for source, policy, error, match in (
         (calling(ANT), lambda observation: 10, InvalidActionError, "is not in its action space"),
         (calling(ANT), lambda observation: 1 // 0, ZeroDivisionError, "division"),
@@ -88,14 +88,14 @@ def test_errors_name_the_seed():
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_invalid_arguments_are_refused(run, arguments, error, match):
+def test_simulate_refuses_invalid_arguments(run, arguments, error, match):
     with pytest.raises(error, match=match):
         run(**{"simulation": calling(ANT), "policies": None, "points": ANT} | arguments)
 
 
 @given(designs, seeds)
 @settings(max_examples=40)
-def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
+def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     points = colony_points(overseen=bool(design.overseen))
 

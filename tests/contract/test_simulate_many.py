@@ -62,7 +62,7 @@ going = {Going.decide: define(agent="going_0")}
 
 @given(worlds.designs(), some_seeds, sizes)
 @settings(max_examples=60)
-def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
+def test_simulate_many_matches_simulate_one_by_one(design, seeds, size):
     """All kinds of decision points: nested, generators, with choices, of entities, named late."""
 
     def source():
@@ -82,7 +82,7 @@ def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
         assert simulation.random.getstate() == alone.random.getstate()
 
 
-def test_without_policies_they_are_plain_runs():
+def test_simulate_many_without_policies_gives_plain_runs():
     ant = decision(agent="ant_0")
     assert [s.log for s in simulate_many(calling(ant, ant), seeds=range(3))] == [
         ["rule", "rule"]
@@ -93,7 +93,7 @@ def test_without_policies_they_are_plain_runs():
     assert simulate_many(calling(ant), {ant: ones}, seeds=[]) == []
 
 
-def test_each_seed_has_a_simulation_of_its_own_and_its_results_stand_in_their_order():
+def test_results_have_one_simulation_per_seed_in_order_of_seeds():
     found = simulate_many(
         Going, {Going.decide: ones}, points=going, seeds=iter([4, 0, 2, 4]), batch_size=2
     )
@@ -149,7 +149,7 @@ def test_policies_own_their_observations_and_get_infos_if_they_take_them():
     assert [simulation.log for simulation in found] == [[1, 1]] * 3
 
 
-def test_policies_that_are_the_same_are_asked_together():
+def test_policy_of_several_points_gets_their_rows_in_one_batch():
     ant, bee = decision(agent="ant_0", **PAIRS), decision(agent="bee_0", **PAIRS)
     cat = decision(agent="cat_0")  # who observes something else
     asked = []
@@ -169,7 +169,7 @@ def test_policies_that_are_the_same_are_asked_together():
     assert asked == [10, 3, 3]
 
 
-def test_simulations_that_have_ended_make_room_for_just_as_many_others():
+def test_ended_simulations_are_replaced_up_to_the_batch_size():
     asked, under_way, ended = [], weakref.WeakSet(), []
 
     class Watched(Going):
@@ -237,7 +237,7 @@ BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_actions_come_as_anything_that_has_rows(space, answer, expected):
+def test_batched_policies_may_return_any_kind_of_rows(space, answer, expected):
     ant = decision(agent="ant_0", action_space=space)
     found = simulate_many(
         calling(ant), {ant: lambda observations: answer}, seeds=range(len(expected))
@@ -331,7 +331,7 @@ def observe(simulation):
         "collect",
     ],
 )
-def test_an_error_anywhere_says_of_which_seed_and_unwinds_all(error, arguments, told, run):
+def test_error_in_a_run_names_its_seed_and_unwinds_all_simulations(error, arguments, told, run):
     Delicate.ended.clear()
     plain, before = vars(Going)["decide"], stacks()
     usual = {
@@ -350,7 +350,7 @@ def test_an_error_anywhere_says_of_which_seed_and_unwinds_all(error, arguments, 
     assert not stacks(before)
 
 
-def test_an_error_in_a_factory_says_of_which_seed():
+def test_error_in_a_factory_names_the_seed():
     models = [Going()]
     with fails(IndexError, "seed 17"):
         simulate_many(lambda: models.pop(), {Going.decide: ones}, points=going, seeds=[20, 17])
@@ -370,7 +370,7 @@ def test_an_error_in_a_factory_says_of_which_seed():
     ],
     ids=plainly,
 )
-def test_invalid_arguments_are_refused(wrong):
+def test_simulate_many_refuses_invalid_arguments(wrong):
     (name,) = wrong
     with pytest.raises(
         OptionValueError, match={"policies": "polic", "seeds": "seed"}.get(name, f"{name} must be")
@@ -397,7 +397,7 @@ def test_plugins_are_for_these_simulations_alone():
     assert len(called) == 6
 
 
-def test_policies_and_rules_may_simulate():
+def test_policies_and_rules_may_call_simulate_many():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def look_ahead(observations):
@@ -424,7 +424,7 @@ def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wante
         simulate_many(Going, seeds=[1, 2], **wanted)
 
 
-def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
+def test_more_simulations_run_at_once_if_the_policy_is_the_slower_part(monkeypatch):
     """Few simulations run at first, for the processor's caches; the results are always the same."""
     monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
     clock = [0.0]  # stands still while simulations run

@@ -66,7 +66,7 @@ def test_an_instance_is_copied_as_it_stands_when_the_environment_is_made():
 
 @pytest.mark.parametrize("named", [True, False], ids=["points", "points of the simulation"])
 @pytest.mark.parametrize("kind", ["class", "factory"])
-def test_a_simulation_is_made_once_for_each_environment_and_reset_for_each_episode(kind, named):
+def test_simulation_is_made_once_per_environment_and_reset_per_episode(kind, named):
     made = []
 
     class Counted(Simulation):
@@ -180,7 +180,7 @@ SIZE = {"size": 3}
         (lambda self, options=None: self.got.append({"options": options}), SIZE, {"options": SIZE}),
     ],
 )
-def test_reset_gets_what_it_takes(reset, given, expected):
+def test_simulation_reset_gets_only_the_parameters_it_declares(reset, given, expected):
     env = single_env(recording(reset), Model.decide)
     env.reset(seed=7, options=given)
     assert env.simulation.got == [expected]
@@ -190,7 +190,7 @@ def seeds_of(env):
     return env.simulation.got
 
 
-def test_every_view_draws_seeds_until_one_is_given_and_derives_the_later_ones():
+def test_seeds_are_drawn_until_one_is_given_and_then_derived():
     one, two, three = (
         make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env)
     )
@@ -211,7 +211,7 @@ def test_every_view_draws_seeds_until_one_is_given_and_derives_the_later_ones():
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", [1]])
-def test_seeds_that_are_none_are_refused_and_nothing_happens(seed):
+def test_invalid_seeds_are_refused_without_a_reset(seed):
     env = begun(single_env(recording(reset_seed), Model.decide), 1)
     with pytest.raises(OptionValueError, match="seed must be a non-negative"):
         env.reset(seed=seed)
@@ -351,7 +351,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("own", OTHERS.values(), ids=OTHERS)
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_attributes_that_cannot_be_optional_methods_are_ignored(make, own):
+def test_attributes_named_like_optional_methods_are_ignored(make, own):
     env = make(type("Own", (Simulation,), own), Model.decide)
     with pytest.raises(NotImplementedError, match=r"has no method state\(\)"):
         env.unwrapped.state()
@@ -432,7 +432,7 @@ async def _do_both(self):
         (_do_both, "an async generator function", "async for _ in self.{}_model(): pass"),
     ],
 )
-def test_a_run_that_runs_nothing_when_it_is_called_is_refused(function, kind, line, name):
+def test_generator_or_coroutine_as_run_or_reset_is_refused(function, kind, line, name):
     model = type("Own", (Simulation,), {name: function})
     for source in (model, model(), lambda: model()):
         with pytest.raises(SimulationError, match=rf"{name}\(\) of Own is {kind}") as raised:

@@ -154,7 +154,7 @@ def beds(function):
 
 
 @pytest.mark.parametrize("by_policy", ["", "b", "bx", "ay"])
-def test_nested_and_overlapping_calls_know_the_actions_of_their_own_rule(by_policy):
+def test_nested_and_overlapping_split_calls_keep_own_rule_actions(by_policy):
     answers = {name: 9 if name in by_policy else RULE for name in "abcxy"}
 
     def told(env):
@@ -249,7 +249,7 @@ def test_items_are_observed_before_their_call_without_answers():
     assert env.simulation.given == [[2, 1, 0]]
 
 
-def test_answers_are_given_to_split_calls_alone():
+def test_answers_parameter_is_refused_without_split():
     mapping = {"observation_space_mapping": lambda hospital, *, _answers: [0, 0]}
     with pytest.raises(DefinitionError, match="_answers"):
         aec_env(Hospital, {Hospital.give: define(**mapping)})
@@ -273,7 +273,7 @@ def test_all_views_and_policies_answer_items():
     assert [day.log for day in days] == [[(6, 6, 6)] * 4] * 2
 
 
-def test_branches_and_ends_amid_a_call_are_exact_and_leave_nothing():
+def test_branches_and_ends_within_a_split_call_are_exact():
     env = begun(aec_env(Day, points()), 5)
     env.step(7)
     assert (
@@ -316,7 +316,7 @@ class Shop:
         self.log.append((yield from self.choose()))
 
 
-def test_functions_that_wait_decide_for_items_too():
+def test_generators_and_coroutines_may_be_split():
     chosen, decided = (
         define(agent=lambda item, shop, name=name: f"{name}_{item}", split=lambda shop: [0, 1])
         for name in ("chosen", "decided")
@@ -348,7 +348,7 @@ def under_another_factor(action, clinic, days, *, _rule):
         clinic.factor = 2
 
 
-def test_apply_runs_the_rule_under_other_parameters_and_its_own_calls_do_not_ask_again():
+def test_apply_can_run_the_rule_without_asking_the_user_again():
     env = begun(
         single_env(
             Clinic,

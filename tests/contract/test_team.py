@@ -61,7 +61,7 @@ def test_an_agent_gets_the_teams_reward_since_its_decision():
     assert team.asked == 5  # not at the None steps
 
 
-def test_one_learner_gets_each_earning_once():
+def test_turn_and_single_views_pay_the_team_reward_once():
     for make in (turn_env, single_env):
         ant, bee = agents()
         policies = {"bee_0": lambda observation: 1} if make is single_env else None
@@ -76,7 +76,7 @@ def test_one_learner_gets_each_earning_once():
         assert rewards == ([1.0, 2.0, 4.0] if make is turn_env else [1.0, 2.0])
 
 
-def test_rounds_pay_each_live_agent_what_the_round_has_earned():
+def test_team_reward_of_a_round_is_paid_to_each_live_agent():
     ant, bee = agents()
     env = parallel_env(calling(ant, bee, ant, bee), [ant, bee], team_reward=Counter(100, 1, 2))
     env.reset()

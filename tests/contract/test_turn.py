@@ -69,7 +69,7 @@ def compared(aec, turn, seed, action_of):
 
 @given(yards.designs, yards.seeds)
 @settings(max_examples=60)
-def test_a_yard_of_births_and_deaths_is_that_of_the_aec_view(design, seed):
+def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
     options = {"possible_agents": yards.ROSTER}
     compared(
         aec_env(lambda: yards.Yard(design), yards.POINTS, **options),
@@ -81,7 +81,7 @@ def test_a_yard_of_births_and_deaths_is_that_of_the_aec_view(design, seed):
 
 @given(worlds.designs(), worlds.seeds, worlds.answers)
 @settings(max_examples=100)
-def test_any_world_is_that_of_the_aec_view(design, seed, answers):
+def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
     points = worlds.points_of(design)
     policies = {points[point]: worlds.advised for point in design.policies} | {
         points[point]: RULE for point in design.rules
@@ -101,7 +101,7 @@ def test_any_world_is_that_of_the_aec_view(design, seed, answers):
 # -- spaces ---------------------------------------------------------------------------------------
 
 
-def test_equal_spaces_stand_with_the_kind_and_the_index_of_the_agent():
+def test_turn_observation_adds_kind_and_index_of_the_agent():
     ant = decision(agent=lambda: "ant_1")
     bee = decision(agent="bee_0", observation_space_mapping=lambda: [3.0, 4.0])
     env = turn_env(calling(ant, bee), [ant, bee])
@@ -153,7 +153,7 @@ def test_different_observations_are_flattened_and_padded_with_zeros():
         turn_env(calling(ant, text), [ant, text])
 
 
-def test_numbers_share_the_largest_space_and_a_mask():
+def test_discrete_actions_of_a_turn_view_share_one_masked_space():
     mask = np.array([0, 1], np.int8)
     ant = decision(
         agent="ant_0", action_space=spaces.Discrete(2, start=5), action_mask_mapping=lambda: mask
@@ -175,7 +175,7 @@ def test_numbers_share_the_largest_space_and_a_mask():
     assert env.simulation.log == [6, 3]
 
 
-def test_boxes_share_a_vector_that_is_scaled_to_the_own_bounds():
+def test_box_actions_of_a_turn_view_are_scaled_to_each_agents_bounds():
     ant = decision(agent="ant_0", **vector(0, 10))
     bee = decision(agent="bee_0", **vector(-1, 3, 2))
     whole = decision(
@@ -202,7 +202,7 @@ def test_boxes_share_a_vector_that_is_scaled_to_the_own_bounds():
         turn_env(calling(ant, unbounded), [ant, unbounded])
 
 
-def test_numbers_beside_boxes_are_chosen_by_preference():
+def test_discrete_actions_beside_boxes_are_chosen_by_preference():
     mask = np.array([1, 0, 1], np.int8)
     ant = decision(
         agent="ant_0",
@@ -265,7 +265,7 @@ def test_the_last_observation_is_that_of_the_agent_that_decided_last():
         env.step(1)
 
 
-def test_a_clone_goes_on_as_its_original_does():
+def test_clone_of_a_turn_view_continues_like_the_original():
     design = yards.Design(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
     env = turn_env(lambda: yards.Yard(design), yards.POINTS, possible_agents=yards.ROSTER)
     env.reset(seed=5)
@@ -291,7 +291,7 @@ def test_a_clone_goes_on_as_its_original_does():
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_it_passes_the_check_of_gymnasium_and_stands_in_vectors(flatten):
+def test_turn_view_passes_check_env_and_works_in_vectors(flatten):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **vector(0, 1))
     options = {"flatten": flatten}
     check_env(turn_env(calling(ant, bee, ant), [ant, bee], **options), skip_render_check=True)
@@ -312,7 +312,7 @@ def test_it_passes_the_check_of_gymnasium_and_stands_in_vectors(flatten):
     vectors.close()
 
 
-def test_states_stand_in_infos_on_request():
+def test_infos_of_the_turn_view_contain_states_on_request():
     class Counting:
         def reset(self):
             self.count = 0

@@ -104,7 +104,7 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
     ),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-def test_all_runners_warn(heard_alone, run):
+def test_all_runners_warn_of_draws_from_global_generators(heard_alone, run):
     run(gambler(random.random))
     assert len(heard_alone(DRAWS)) == 1
 
@@ -171,9 +171,7 @@ ANTS = hill("ant_0", "ant_1")
     ],
     ids=["policies", "a roster"],
 )
-def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(
-    heard, options, absent
-):
+def test_agent_that_never_appears_is_warned_of_once_at_episode_end(heard, options, absent):
     env = aec_env(ANTS, ant, **options)
     for _ in range(2):
         play_in_turns(env, seed=1)
@@ -184,7 +182,7 @@ def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode
     assert "ant_0, ant_1" in those_who_came
 
 
-def test_runners_tell_of_it_once_for_all_simulations(heard):
+def test_runners_warn_once_of_an_agent_that_never_appears(heard):
     policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
     simulate_many(ANTS, policies, seeds=range(5), points=ant)
     assert len(heard(ABSENT)) == 1
@@ -230,7 +228,7 @@ def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard):
     assert env.agents == []
 
 
-def test_turns_are_no_standstill(heard):
+def test_agents_acting_in_turns_cause_no_standstill_warning(heard):
     one, two = decision(agent="one"), decision(agent="two")
     env = begun(parallel_env(calling(*[one, two] * 400), [one, two]), 1)
     for number in range(600):

@@ -7,7 +7,7 @@ import pytest
 from simenv_marl.core.switching.awaiting import Answers, wait_for
 
 
-def test_answers_are_taken_with_their_keys():
+def test_answers_of_coroutines_are_returned_with_their_keys():
     async def double(number):
         await asyncio.sleep(0)
         return 2 * number

@@ -51,7 +51,7 @@ def _nobody_is_running_afterwards():
 
 
 @EVERY_DRIVER
-def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context():
+def test_simulation_runs_on_one_stack_in_one_context():
     variable = contextvars.ContextVar("variable", default="nobody's")
     seen = []
 
@@ -182,7 +182,7 @@ def test_decisions_in_threads_of_the_model_fail_the_step(way, last):
 
 
 @EVERY_DRIVER
-def test_a_refusal_is_raised_once_or_noted_on_another_error():
+def test_wrong_thread_error_is_raised_once_or_noted_on_another_error():
     def passed_on():
         return by_pool(decide)
 
@@ -218,7 +218,7 @@ class InTurn(futures.Executor):
 
 
 @EVERY_DRIVER
-def test_an_executor_that_runs_in_turn_takes_the_place_of_threads(monkeypatch):
+def test_sequential_executor_can_replace_a_thread_pool_of_the_model(monkeypatch):
     def main(simulation):
         with futures.ThreadPoolExecutor() as pool:
             simulation.log += pool.map(lambda number: (number, decide()), range(3))

@@ -331,7 +331,7 @@ class Lasting(SimulationInterface):
 
 
 @EVERY_DRIVER
-def test_a_loop_that_lives_for_many_episodes_is_changed_once(loud):
+def test_event_loop_kept_over_episodes_is_patched_once(loud):
     decide, messages = decision(), []
     env = single_env(lambda: Lasting(clerk_of(decide)), decide)
     model = env.simulation

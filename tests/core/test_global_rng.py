@@ -74,7 +74,7 @@ def plain(seed):
 
 @EVERY_DRIVER
 @EVERY_VIEW
-def test_environments_draw_as_plain_runs_do_whatever_else_draws(view):
+def test_global_rng_draws_match_plain_runs_despite_other_draws(view):
     logs = {seed: plain(seed) for seed in (7, 8)}
     envs = {seed: view(Casino, {BET: define(agent="player_0")}, global_rng=True) for seed in logs}
 
@@ -98,7 +98,7 @@ def test_environments_draw_as_plain_runs_do_whatever_else_draws(view):
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
-def test_without_it_generators_are_everybodys():
+def test_global_generators_are_shared_unless_global_rng_is_set():
     env = begun(aec_env(Casino, POINTS), 7)
     before = world()
     env.step(RULE)
@@ -153,7 +153,7 @@ def test_other_bit_generators_of_the_user_stay():
 
 
 @EVERY_DRIVER
-def test_one_environment_in_the_rule_of_another():
+def test_global_rng_works_for_a_run_nested_in_another():
     """The state of the outer one is in place in its simulation's thread, too."""
 
     class Gambler(Casino):
@@ -165,7 +165,7 @@ def test_one_environment_in_the_rule_of_another():
     assert outer.inner.log == outer.log == plain(3)
 
 
-def test_two_at_work_at_once_in_two_threads_are_refused():
+def test_global_rng_environments_in_two_threads_at_once_are_refused():
     """There is one state of the global generators in a process, and whoever is at work has it."""
     other, errors = aec_env(Casino, POINTS, global_rng=True), []
 

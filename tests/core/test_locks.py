@@ -131,7 +131,7 @@ def test_a_lock_that_a_suspended_simulation_holds_is_an_error(driver, holder, wa
 
 
 @DRIVERS
-def test_a_wait_in_another_thread_is_told_on_stderr(driver, capfd):
+def test_lock_wait_in_another_thread_is_reported_on_stderr(driver, capfd):
     def use():
         first.reset()
         second.reset()  # waits
@@ -206,7 +206,7 @@ class Leaves(Sleeps):
 
 @DRIVERS
 @pytest.mark.parametrize("model", [Sleeps, Lends, Leaves])
-def test_a_wait_that_ends_by_itself_is_not_told(driver, model, capfd):
+def test_wait_for_a_lock_that_ends_is_not_reported(driver, model, capfd):
     first = env_of(Leaves if model is Leaves else Lends if model is Lends else Model, driver)
     second = env_of(model, driver)
     first.reset()
@@ -234,7 +234,7 @@ def fork():
 
 
 @pytest.mark.skipif(not LISTED, reason=NOT_LISTED)
-def test_forks_end_the_watching_thread():
+def test_fork_ends_the_thread_that_watches_locks():
     alone = fork()  # threads of NumPy end at forks, too
     listed = threading.enumerate()
     first, second = [env_of(Model, "greenlet") for _ in range(2)]

@@ -62,7 +62,7 @@ def test_a_native_stack_trace_ends_at_the_begin_of_the_stack():
     alone(trace_at_all_depths)
 
 
-def test_libraries_that_trace_are_named_where_stacks_have_no_begin(monkeypatch):
+def test_warning_names_libraries_with_unsafe_native_stack_traces(monkeypatch):
     monkeypatch.setattr(greenlets, "_definition", lambda: None)
     monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
     greenlets.warn_of_native_traces.cache_clear()

@@ -151,7 +151,7 @@ def assert_alike(one, other):
 
 
 @pytest.mark.parametrize("make", ERRORS.values(), ids=ERRORS)
-def test_errors_cross_with_all_that_belongs_to_them(make):
+def test_errors_sent_between_processes_keep_notes_and_causes(make):
     error = make()
     again = unpack_error(pack_error(error))
     assert again is not error
@@ -193,7 +193,7 @@ def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error
 
 
 @pytest.mark.parametrize("notes", ["text", 3, None, ("one", "two"), {}, [3, "one"], [[]]], ids=str)
-def test_notes_that_are_no_list_of_texts_are_no_obstacle(notes):
+def test_errors_with_malformed_notes_cross_to_other_processes(notes):
     error = ValueError("noted")
     error.__notes__ = notes
     again = unpack_error(pack_error(error))

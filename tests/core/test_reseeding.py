@@ -78,7 +78,7 @@ class Crowd:
 
 
 @given(st.integers(0, 2**80), st.integers(0, 7))
-def test_the_same_seed_gives_the_same_states_whatever_was_drawn_before(seed, before):
+def test_reseeding_gives_the_same_states_after_any_earlier_draws(seed, before):
     one, other = Crowd(1), Crowd(2)
     for _ in range(before):
         other.drawn()
@@ -105,7 +105,7 @@ def test_spawned_generators_are_reseeded_too(kind):
     assert generator.bit_generator.random_raw() != kind(1).random_raw()
 
 
-def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
+def test_reseeded_generators_differ_from_ones_seeded_directly():
     one, other, legacy = random.Random(), np.random.default_rng(), np.random.RandomState()
     reseed_generators([one, other, legacy], 7)
     drawn = {one.random(), other.random(), legacy.random()}
@@ -148,7 +148,7 @@ def draws(streams, *names):
     return [streams[name].random() for name in names]
 
 
-def test_a_stream_depends_on_the_seed_and_its_name_alone():
+def test_stream_depends_only_on_the_seed_and_its_name():
     one, other = Streams(3), Streams(3)
     other["b"].random(100)
     assert draws(one, "a", "a") == draws(other, "a", "a")
@@ -216,11 +216,11 @@ def test_named_streams_are_the_same_in_each_process():
         assert text.strip() == str(here)
 
 
-def test_text_names_have_their_numbers_of_old():
+def test_named_stream_draws_the_same_numbers_in_every_version():
     assert draws(Streams(3), "a", "pump 2") == [0.6653036503847838, 0.9648250980937277]
 
 
-def test_equal_names_have_one_generator():
+def test_equal_stream_names_share_one_generator():
     for alike in [(3, 3.0, np.int64(3)), (1, True), (2.5, np.float32(2.5)), ("a", np.str_("a"))]:
         assert len({*draws(Streams(3), alike[0])} | {draws(Streams(3), n)[0] for n in alike}) == 1
 
@@ -240,7 +240,7 @@ def test_names_without_a_hash_are_refused(name):
 
 
 @pytest.mark.parametrize("reseed", [Streams.reseed, reseed_generators])
-def test_streams_are_reseeded_in_place_and_those_to_come_as_well(reseed):
+def test_reseed_changes_existing_streams_in_place_and_later_ones(reseed):
     def future(seed, used):
         streams = Streams(3)
         held = streams["a"]
@@ -263,7 +263,7 @@ def test_entities_that_hold_their_streams_are_reseeded_with_them():
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))]
 )
-def test_streams_are_copied_as_they_stand(duplicate):
+def test_copied_streams_continue_independently_from_the_same_state(duplicate):
     streams = Streams(3)
     streams["a"].random()
     twin = duplicate(streams)

@@ -72,7 +72,7 @@ def assert_alike(one, other):
     ],
     ids=str,
 )
-def test_observations_are_cast(space, value, expected):
+def test_observations_are_cast_to_their_space(space, value, expected):
     assert_alike(observation_cast(space)(value), expected)
 
 
@@ -137,7 +137,7 @@ def leaves(value):
     ],
     ids=["box", "integers", "tuple", "dict", "list"],
 )
-def test_casts_and_duplicates_share_nothing(made_of, value):
+def test_casts_and_duplicates_share_no_memory_with_the_original(made_of, value):
     kept = copy.deepcopy(value)
     found = made_of(value)
     assert_alike(found, value)
@@ -147,7 +147,7 @@ def test_casts_and_duplicates_share_nothing(made_of, value):
     assert not same(found, kept)
 
 
-def test_same_compares_number_for_number():
+def test_same_compares_arrays_dicts_and_tuples_by_value():
     """Each of these is the same as its copy alone."""
     arrays = [
         np.array(numbers) for numbers in ([1.0, np.nan], [1.0, 2.0], [1.0, 4.0], [1.0, 2.0, 5.0])
@@ -346,7 +346,7 @@ def test_samples_are_legal_actions_and_observations(space):
     assert observation_cast(space)(blank(space)) in space
 
 
-def test_other_spaces_are_asked_themselves_and_actions_are_copied():
+def test_action_check_uses_contains_of_other_spaces_and_copies():
     given = np.array([1, 6])
     found = action_check(DIALS)(given)
     assert_alike(found, given)
@@ -360,7 +360,7 @@ def test_other_spaces_are_asked_themselves_and_actions_are_copied():
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def test_masks_are_new_arrays():
+def test_mask_cast_returns_a_new_int8_array():
     column = np.int8([[1, 9], [0, 9], [1, 9]])[:, 0]
     for given in ([1, 0, 1], np.array([1.0, 0.0, 1.0]), column, np.array([True, False, True])):
         found = mask_cast(DIAL)(given)

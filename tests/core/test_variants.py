@@ -73,7 +73,7 @@ def test_a_variant_is_accepted_like_a_simulation():
     assert Farm().sow(0) == "wheat"  # and the model is what it was
 
 
-def test_arguments_override_those_of_the_variant():
+def test_arguments_override_or_extend_the_fields_of_a_variant():
     assert simulate(DEAR, {HARVEST: five}).log == [("wheat", 50)] * 3
     assert simulate(DEAR, plugins=[(dearer, HARVEST, "after")]).log == [("wheat", 200)] * 3
     limited = replace(DEAR, options={"max_steps": 1})
@@ -131,7 +131,7 @@ def test_invalid_variants_are_refused(changes, error, message):
         aec_env(replace(LARGE, **changes))
 
 
-def test_an_environment_says_what_it_is_made_of():
+def test_provenance_lists_the_parts_of_an_environment():
     env = aec_env(DEAR, max_steps=np.int64(9), policies={HARVEST: five})
     assert env.provenance()["seed"] is None
     env.reset(seed=3)
@@ -154,7 +154,7 @@ def test_an_environment_says_what_it_is_made_of():
     assert provenance(DEAR, seed=3, max_steps=9, policies={HARVEST: five}) == said
 
 
-def test_versions_are_those_of_the_packages_that_the_model_comes_from():
+def test_provenance_has_the_versions_of_the_models_packages():
     move, untold = (
         "mesa.examples.advanced.wolf_sheep.agents.Wolf.move",
         "typing_extensions.reveal_type",
@@ -166,7 +166,7 @@ def test_versions_are_those_of_the_packages_that_the_model_comes_from():
     assert said["variant"] is None
 
 
-def test_values_that_are_no_json_are_named():
+def test_provenance_writes_values_that_are_no_json_as_text():
     ant = decision(agent="ant_0")
     parameters = {
         "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},

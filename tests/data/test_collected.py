@@ -228,7 +228,7 @@ def test_observations_actions_and_masks_of_several_parts_are_stacked():
     assert of_bee.actions.tolist() == [[1, 0]] * 2
 
 
-def test_policies_can_tell_decisions_apart_and_their_extras_stand_row_by_row():
+def test_policies_get_identities_of_decisions_and_may_return_extras():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     buffer = np.zeros((3, 2), np.float32)
 

@@ -82,7 +82,7 @@ def test_mixtures_draw_by_seed_and_decision_alone():
     ]  # by SplitMix64, in any version
 
 
-def test_mixtures_give_policies_what_is_theirs():
+def test_mixtures_pass_each_component_its_own_rows():
     seen, mask = [], [0, 1, 1] + [0] * 7
 
     def informed(observations, infos, identities):
@@ -215,7 +215,7 @@ def test_policies_are_asked_while_the_rule_decides(size):
         assert np.array_equal(getattr(found.trajectories, name), getattr(alone, name)), name
 
 
-def test_a_policy_that_leaves_the_decision_to_the_rule_agrees_with_it():
+def test_policy_that_answers_rule_counts_as_agreeing_with_the_rule():
     policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
     found = compare_with_rule(script(crowd), {Being.act: policy}, points=TOLD, seeds=range(4))[
         Being.act

@@ -125,7 +125,7 @@ def test_a_batched_turn_policy_gets_stacks():
     assert max(sizes) > 1
 
 
-def test_masks_of_several_numbers_reach_turn_policies():
+def test_multidiscrete_masks_reach_turn_policies():
     several = {
         "agent": lambda: "ant_0",
         "action_space": spaces.MultiDiscrete([2, 3]),
@@ -194,7 +194,7 @@ def test_evaluations_and_collections_take_a_policy_for_all():
     assert names == {"bake": {"oven_0", "oven_1"}, "sell": {"shop"}}
 
 
-def test_beside_one_agent_a_turn_policy_answers_all_others():
+def test_turn_policy_can_answer_for_all_but_one_agent():
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     expected = played(env, predict, 1)
     policies = turn_policy(predict, like=env)
@@ -213,7 +213,7 @@ def test_beside_one_agent_a_turn_policy_answers_all_others():
         turn_env(Bakery, POINTS, policies=policies)
 
 
-def test_refusals_name_the_remedy():
+def test_turn_and_joint_policies_explain_their_refusals():
     ant = decision(agent="ant_0")
     env = turn_env(calling(ant), [ant])
     with pytest.raises(OptionValueError, match="SimulationJointEnv"):

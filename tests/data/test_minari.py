@@ -94,7 +94,7 @@ def thirds(seen):
         (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>"),
     ],
 )
-def test_data_sets_hold_what_was_collected_and_say_who_decided(policy, name):
+def test_data_sets_hold_the_collected_episodes_and_the_policy_name(policy, name):
     points = beings(rule_action_mapping=lambda decided, being: being.health)
     given = {"points": points, "seeds": [3, 1, 5, 2**70]}
     recorded = record_dataset(NAME, script(herd), {Being.act: policy}, batch_size=2, **given)
@@ -119,7 +119,7 @@ SPACES = [
 
 
 @pytest.mark.parametrize("space", SPACES, ids=str)
-def test_all_kinds_of_spaces_are_read_again(space):
+def test_minari_reads_all_kinds_of_spaces(space):
     space.seed(1)
     ant = decision(
         agent="ant_0",
@@ -132,7 +132,7 @@ def test_all_kinds_of_spaces_are_read_again(space):
     check(found, save_dataset(NAME, found))
 
 
-def test_infos_are_as_many_as_observations():
+def test_data_set_infos_have_one_row_per_observation():
     def main(simulation):
         simulation.log += [ant()]
         simulation.log += [ant()]
@@ -182,7 +182,7 @@ def test_the_environment_can_be_recovered():
     env.close()
 
 
-def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
+def test_record_dataset_overwrites_nothing_and_refuses_before_running():
     def never(simulation):
         raise AssertionError
 
@@ -241,7 +241,7 @@ def test_unknown_rule_actions_are_refused():
     assert not minari.list_local_datasets()
 
 
-def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
+def test_examples_of_the_demonstrations_page_run(monkeypatch):
     """With the examples that need Minari, which are skipped where it is not there."""
     page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
     monkeypatch.syspath_prepend(page.parent)

@@ -86,7 +86,7 @@ def ticks(axes):
     return [label.get_text() for label in axes.get_yticklabels()]
 
 
-def test_charts_show_each_action_by_its_name_and_each_reward():
+def test_timeline_shows_each_labelled_action_and_each_reward():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: 2.0)
     answers = {ant: iter([1, 2, 3]), bee: iter([7, 8])}
     policies = {key: lambda observations, own=own: [next(own)] for key, own in answers.items()}
@@ -116,7 +116,7 @@ def test_charts_show_each_action_by_its_name_and_each_reward():
         plot_timeline(found, action_names="dig")
 
 
-def test_the_clock_is_what_runs_from_left_to_right():
+def test_timeline_has_the_simulation_time_on_the_x_axis():
     def main(simulation):
         simulation.log.append(Being(0).act())  # whom the model has let go of lives to the end
         keeper = Being(1)
@@ -275,7 +275,7 @@ def test_numbers_and_too_many_different_actions_share_a_scale():
         assert scale.get_clim() == (0, most)
 
 
-def test_episodes_are_counted_from_either_end_also_those_without_decisions():
+def test_episode_index_counts_from_either_end_and_counts_empty_ones():
     ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
     main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
     found = collect_episodes(script(main), {ant: ones}, seeds=[0, 8, 9])
@@ -293,7 +293,7 @@ def test_episodes_are_counted_from_either_end_also_those_without_decisions():
 
 
 @pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
-def test_arguments_that_cannot_be_drawn_and_a_missing_matplotlib_are_errors(draw, monkeypatch):
+def test_plots_refuse_invalid_data_and_name_the_missing_extra(draw, monkeypatch):
     for wrong in (None, {}, {"ant": 1}):
         with pytest.raises(OptionValueError, match="draw"):
             draw(wrong)
@@ -302,7 +302,7 @@ def test_arguments_that_cannot_be_drawn_and_a_missing_matplotlib_are_errors(draw
         draw(herd(1, 1))
 
 
-def test_pictures_are_drawn_where_they_are_asked_for():
+def test_plots_draw_on_the_given_figure_or_axes():
     found = herd(8, 2)
     whole = Figure(figsize=(20, 8), layout="constrained")
     assert plot_timeline(found, figure=whole) is whole
@@ -347,7 +347,7 @@ def test_a_point_is_the_mean_of_the_agents_or_of_one_or_the_sum(per, rows):
     assert dict(found) == rows or per == "team"
 
 
-def test_intervals_are_the_same_each_time_and_teams_are_of_all_policies():
+def test_plotted_intervals_are_reproducible_and_teams_cover_all_policies():
     intervals = [plot_returns(paid_by_seed(3)).axes[0].texts[0].get_text() for _ in range(2)]
     assert intervals == ["8  [-5.145, 21.14]"] * 2  # by Student's t
     ant, bee = (
@@ -371,7 +371,7 @@ def test_several_collections_stand_side_by_side():
     ]
 
 
-def test_hundreds_of_agents_are_too_many_rows():
+def test_plot_returns_refuses_hundreds_of_rows():
     many = herd(100, 1)
     for per, told in (("agent", "100 rows"), ("wolf", "per")):
         with pytest.raises(OptionValueError, match=told):

@@ -115,7 +115,7 @@ def test_arrays_of_rule_actions_are_cast_and_copied():
     assert decided.tolist() == [0.25, 0.5]
 
 
-def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
+def test_rule_action_mapping_beside_apply_runs_after_the_rule():
     tank = {"level": 0}
 
     def pour():

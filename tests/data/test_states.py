@@ -79,7 +79,7 @@ def checking_one(observation, info, *, _state):
 
 @given(designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
 @settings(max_examples=40)
-def test_states_are_those_of_decisions_and_ends(design, several, size, most):
+def test_trajectories_have_the_states_at_decisions_and_ends(design, several, size, most):
     found = collect_episodes(
         lambda: Yard(design),
         everywhere(by_row(advised)),
@@ -104,7 +104,7 @@ def test_states_are_those_of_decisions_and_ends(design, several, size, most):
 
 @given(designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
 @settings(max_examples=20)
-def test_states_of_observations_are_those_of_an_aec_environment(design, several, whose):
+def test_states_of_observations_match_an_aec_environment(design, several, whose):
     options = {
         "points": POINTS,
         "max_steps": 12,
@@ -140,7 +140,7 @@ def test_states_of_observations_are_those_of_an_aec_environment(design, several,
             assert state.tolist() == expected[key].tolist()
 
 
-def test_states_are_not_asked_where_nobody_wants_them():
+def test_state_is_not_called_where_no_result_or_policy_uses_it():
     class Silent(Yard):
         def state(self):
             raise AssertionError
@@ -192,7 +192,7 @@ def test_states_of_ends_are_recorded_with_plugins_and_either_driver():
         remove_handler(f"{HERE}.Yard.plan", "after")
 
 
-def test_states_stand_in_data_sets(tmp_path, monkeypatch):
+def test_data_sets_contain_states(tmp_path, monkeypatch):
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     policies = {"planner": by_row(lambda observation: 2)}

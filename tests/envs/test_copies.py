@@ -57,7 +57,7 @@ def episode(env, **reset):
 
 @pytest.mark.parametrize("name", MAKERS)
 @COPIES
-def test_a_copy_goes_on_as_the_original_would(name, copied):
+def test_copy_of_an_environment_gives_the_episodes_of_the_original(name, copied):
     """Before the first episode, after it, and when it was closed; its generators come along."""
     env = MAKERS[name]()
     for number in range(3):
@@ -74,7 +74,7 @@ def test_a_copy_goes_on_as_the_original_would(name, copied):
 
 @COPIES
 @pytest.mark.parametrize("make", [lambda env: TimeLimit(env, 3), OrderEnforcingWrapper])
-def test_wrappers_are_copied(copied, make):
+def test_copy_of_a_wrapped_environment_keeps_the_wrapper(copied, make):
     env = make((aec_env if make is OrderEnforcingWrapper else single_env)(Walk, Walk.choose))
     twin = copied(env)
     assert type(twin) is type(env)

@@ -130,7 +130,7 @@ def test_padded_removed_agents_get_their_reward_then_blanks():
 
 @pytest.mark.parametrize("steps", [1, 2])
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_a_limit_of_time_truncates_all_alike(steps, view, action):
+def test_max_steps_truncate_all_padded_agents(steps, view, action):
     env = begun(pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, max_steps=steps)), 0)
     for _ in range(steps):
         results = env.step(action)
@@ -139,7 +139,7 @@ def test_a_limit_of_time_truncates_all_alike(steps, view, action):
     assert terminations == {"being_1": False, "being_2": False}
 
 
-def test_masks_are_open_and_clocks_go_on():
+def test_padded_absent_agents_have_open_masks_and_the_current_time():
     program = "1 acts, 1 o'clock, 1 acts, 1 leaves, 2 o'clock, 2 acts, 3 o'clock, 2 acts"
     masked = beings(
         action_mask_mapping=lambda being: [0, 1, 0],
@@ -175,7 +175,7 @@ def test_masks_are_open_and_clocks_go_on():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_after_an_error_nobody_is_there_before_a_reset():
+def test_agents_are_empty_after_an_error_until_the_reset():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
     env = begun(pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES)), 0)
     with pytest.raises(ZeroDivisionError):

@@ -113,7 +113,7 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode, processes):
     ours.close()
 
 
-def test_the_view_can_be_chosen():
+def test_vector_env_takes_the_view_as_an_option():
     assert isinstance(
         vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict
     )
@@ -125,7 +125,7 @@ def seeds_of(envs):
     return [simulation.seed for simulation in envs.get_attr("simulation")]
 
 
-def test_seeds_are_one_for_all_or_one_for_each():
+def test_vector_reset_takes_one_seed_or_one_per_sub_environment():
     envs, drawn = vector_env(Counter, Counter.decide, num_envs=3), []
     for seed, told in ((7, [7, 8, 9]), (np.int64(4), [4, 5, 6])):
         envs.reset(seed=seed)
@@ -144,7 +144,7 @@ def test_seeds_are_one_for_all_or_one_for_each():
         envs.reset(seed=1.5)
 
 
-def test_some_can_be_reset_with_options_for_them():
+def test_reset_mask_resets_some_sub_environments_with_options():
     envs = vector_env(Counter, Counter.decide, num_envs=3)
     with pytest.raises(NotResetError, match="no episode yet"):
         envs.step([1, 1, 1])
@@ -192,7 +192,7 @@ def test_without_autoreset_an_ended_episode_must_be_reset(processes):
         ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options, error, match):
+def test_invalid_options_are_refused(options, error, match):
     with pytest.raises(error, match=match):
         vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
@@ -413,7 +413,7 @@ def test_vector_environments_cannot_be_copied_or_pickled():
 
 
 @PROCESSES
-def test_close_unwinds_all_and_only_once(processes):
+def test_close_unwinds_all_simulations_and_can_be_repeated(processes):
     stacks_before, processes_before = stacks(), set(multiprocessing.active_children())
     for prepare in (
         lambda envs: None,
@@ -461,7 +461,7 @@ def test_an_error_of_one_simulation_lets_the_others_unwind():
     assert not stacks(stacks_before)
 
 
-def test_one_that_is_dropped_unwinds_all():
+def test_dropped_vector_env_unwinds_all_simulations():
     stacks_before = stacks()
     simulations = begun(vector_env(Counter, Counter.decide, num_envs=2)).get_attr("simulation")
     gc.collect()
@@ -470,7 +470,7 @@ def test_one_that_is_dropped_unwinds_all():
 
 
 @pytest.mark.parametrize("identity", IDS[:-1])
-def test_gymnasium_makes_it_of_registered_ids(identity):
+def test_make_vec_makes_a_vector_env_of_registered_ids(identity):
     given = {"num_envs": 3, "max_steps": 3}
     ours = gymnasium.make_vec(identity, vectorization_mode="vector_entry_point", **given)
     assert type(ours).__name__ == "SimulationVectorEnv"
@@ -489,7 +489,7 @@ def test_gymnasium_makes_it_of_registered_ids(identity):
     envs.close()
 
 
-def test_neither_answers_nor_results_are_held_longer_than_they_are_used():
+def test_step_keeps_no_reference_to_decided_values():
     class Answer:
         pass
 

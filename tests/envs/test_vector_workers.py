@@ -115,7 +115,7 @@ def test_objects_that_cannot_be_pickled_are_refused():
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
 
 
-def test_an_error_says_of_which_simulation_and_the_next_reset_works():
+def test_worker_error_names_the_sub_environment_and_reset_recovers():
     envs = workers(
         Failing,
         definition(

@@ -162,7 +162,7 @@ def test_a_latin_hypercube_has_one_row_in_each_slice():
         design(factors, "latin_hypercube", 10, seed=-1)
 
 
-def test_rounding_leaves_no_range():
+def test_rounded_samples_stay_within_their_range():
     narrow = design({"x": (0.1, np.nextafter(0.1, 1))}, "latin_hypercube", 64)["x"]
     assert set(narrow) == {0.1, np.nextafter(0.1, 1)}
 

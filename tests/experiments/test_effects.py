@@ -27,7 +27,7 @@ def linear(a=0, b=0, c="x", seed=0):
     return a + 2 * b * (1 if c == "x" else 3)
 
 
-def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
+def test_main_effects_and_interactions_match_a_known_model(tmp_path):
     def model(**row):
         return Script(lambda simulation: simulation.log.append(linear(**row)))
 
@@ -55,7 +55,7 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
         found.cells("a", "z")
 
 
-def test_many_numbers_are_grouped():
+def test_factor_with_many_values_is_grouped_into_quarters():
     found = effects(
         told(design({"a": (0.0, 1.0), "b": (0.0, 1.0), "c": ["x", "y"]}, "sobol", 64), linear)
     )
@@ -72,7 +72,7 @@ def test_many_numbers_are_grouped():
     assert found["mean"].is_monotonic_increasing
 
 
-def test_all_that_is_missing_is_one_level():
+def test_missing_values_of_a_factor_are_one_level():
     table = pd.DataFrame({"a": [0, 1, 0, 1], "b": 0.0, "c": [1.0, 1.0, math.nan, math.nan]})
     found = effects(told(table, lambda a, b, c, seed: a))
     assert found.main.loc["c"][["mean", "count"]].values.tolist() == [[0.5, 4], [0.5, 4]]
@@ -88,14 +88,14 @@ def test_many_factors_are_drawn_in_rows():
     assert figure.get_figwidth() < 14
 
 
-def test_sobol_indices_are_those_of_the_model():
+def test_sobol_indices_match_a_known_model():
     found = sobol_indices(told(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 512), linear))
     assert list(found.index) == ["a", "b"]
     for column in ("first", "total"):
         assert found[column].tolist() == pytest.approx([0.2, 0.8], abs=0.03)
 
 
-def test_invalid_arguments_are_refused():
+def test_effects_refuse_invalid_arguments():
     factors = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
     frame = told(design(factors, "halton", 6), linear)
     whole, single = (told(design(factors, "saltelli", number), linear) for number in (2, 1))
@@ -117,7 +117,7 @@ def test_invalid_arguments_are_refused():
                 look(table, **given)
 
 
-def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
+def test_intervals_of_effects_measure_variation_over_seeds_only():
     noise = {"quiet": 0, "still": 0, "loud": 4}
     table, value = (
         design({"a": list(noise), "b": [0, 1]}),
@@ -133,7 +133,7 @@ def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
     assert alone.loc[("a", "quiet"), "low"] < 50 < alone.loc[("a", "quiet"), "high"]
 
 
-def test_shares_have_the_intervals_of_shares():
+def test_effects_on_proportions_have_wilson_intervals():
     found = effects(
         told(design({"a": [0, 1]}), lambda a, seed: float(seed < 3 * a), range(12))
     ).main

@@ -191,7 +191,7 @@ def test_the_summary_is_paired_by_seed(confidence):
         *((equal, "equal", False) for equal in ([2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0])),
     ],
 )
-def test_some_values_have_no_interval(values, note, proportion):
+def test_interval_is_nan_with_a_reason_where_none_can_be_computed(values, note, proportion):
     low, high, why = interval(np.array(values), 0.95, proportion=proportion)
     assert np.isnan([low, high]).all()
     assert note in why
@@ -214,7 +214,7 @@ def test_events_that_were_not_seen_have_no_interval_of_zero_width():
     assert 0.25 < unknown < 0.45
 
 
-def test_the_summary_says_why_there_is_no_interval_and_improvements_count_ties_half():
+def test_summary_notes_missing_intervals_and_ties_count_half():
     contenders = {"a": {}, "same": {}, "some": {"keeper": some}, "much": {"keeper": much}}
     found = evaluate(
         Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1}
@@ -242,7 +242,7 @@ def test_the_summary_says_why_there_is_no_interval_and_improvements_count_ties_h
     found.plot()
 
 
-def test_shares_have_intervals_by_wilsons_score_also_where_some_are_missing():
+def test_proportions_have_wilson_intervals_even_with_missing_values():
     some_seeds = np.arange(12) < 3
     wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
     student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
@@ -299,7 +299,7 @@ def test_evaluation_stops_as_soon_as_intervals_are_narrow_enough():
     assert float((summary["high"] - summary["low"]).iloc[0]) <= 2.0
 
 
-def test_the_team_is_what_its_user_makes_of_the_returns():
+def test_team_argument_computes_the_return_of_the_team():
     def team(returns):
         assert "keeper" in returns
         assert "stranger" not in returns
@@ -457,7 +457,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)
 
 
-def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_need():
+def test_import_loads_neither_testing_nor_experiment_dependencies():
     names = {"pandas", "scipy.stats", "pydoe", "SALib", "simenv_marl.testing"}
     assert run_code(f"import sys, simenv_marl; print({names} & sys.modules.keys())") == "set()\n"
 

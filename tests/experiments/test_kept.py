@@ -96,7 +96,7 @@ def test_second_call_runs_only_new_seeds_and_contenders(tmp_path):
     assert len(begun) == 8
 
 
-def test_bar_begins_with_the_episodes_that_are_kept(tmp_path, capsys):
+def test_progress_bar_begins_with_the_stored_episodes(tmp_path, capsys):
     run(tmp_path)
     run(tmp_path, seeds=range(6), progress=True)
     shown = capsys.readouterr().err
@@ -118,7 +118,7 @@ def test_counts_of_policies_are_kept(tmp_path):
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, MANY | {"batch_size": 1}], ids=plainly)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, TimeoutError])
-def test_interrupts_and_errors_keep_what_is_finished(error, arguments, tmp_path):
+def test_interrupts_and_errors_keep_finished_runs(error, arguments, tmp_path):
     if error is KeyboardInterrupt and "workers" in arguments:
         pytest.skip("an interrupt reaches the parent; the kills below end workers")
     shop, begun = end_at(2, error)
@@ -137,7 +137,7 @@ def test_interrupts_and_errors_keep_what_is_finished(error, arguments, tmp_path)
     assert found.frame.equals(run(None, contenders={"rule": {}}).frame)
 
 
-def test_torn_line_is_an_episode_that_is_missing(tmp_path):
+def test_episode_of_a_torn_line_is_run_again(tmp_path):
     whole = run(tmp_path)
     (path,) = tmp_path.glob("*.jsonl")
     path.write_bytes(path.read_bytes()[:-9])
@@ -177,7 +177,7 @@ def test_other_metrics_and_stores_of_experiments_are_refused(tmp_path):
     assert begun == []
 
 
-def test_invalid_arguments_make_no_store(tmp_path):
+def test_invalid_arguments_create_no_store(tmp_path):
     for arguments in ({"baseline": "x"}, {"contenders": {"a": {"nobody.at": some}}}, {"team": 3}):
         with pytest.raises((OptionValueError, ValueError, LookupError)):
             run(tmp_path / "store", **arguments)
@@ -237,7 +237,7 @@ def test_team_is_computed_anew(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_misnamed_agent_is_an_error_and_its_runs_are_not_kept(workers, tmp_path):
+def test_misnamed_agent_is_an_error_and_its_runs_are_not_stored(workers, tmp_path):
     contenders = {"right": {"being_1": much}, "wrong": {"beeing_1": much}}
     given = {"seeds": range(3), "points": beings(), "store": tmp_path, "workers": workers}
     with pytest.raises(AgentError, match="'wrong' has a policy for 'beeing_1'"):

@@ -92,7 +92,7 @@ def test_contributions_add_up_to_the_difference(seed, driver, method, forced, st
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_the_baseline_may_be_any_policies(method):
+def test_ledger_baseline_may_be_any_policies(method):
     for baseline in (boldest, dict.fromkeys(POINTS, boldest), {"warden_0": boldest}):
         by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(POINTS, baseline)
         found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, baseline=baseline, method=method)
@@ -101,7 +101,7 @@ def test_the_baseline_may_be_any_policies(method):
         assert found.frame["contribution"].sum() == pytest.approx(difference, abs=1e-9)
 
 
-def test_policies_of_all_agents_decide_in_copies_too():
+def test_ledger_takes_turn_and_joint_policies_of_all_agents():
     """The learner of a turn view, and that of a joint view, whose answers are for a round."""
     roster = {next(iter(POINTS)): [f"stall_{number}" for number in range(6)]}
     turns = turn_policy(
@@ -130,7 +130,7 @@ def test_policies_of_all_agents_decide_in_copies_too():
         assert len(once.frame) == len(there.frame)
 
 
-def test_a_metric_or_a_team_takes_the_place_of_rewards():
+def test_ledger_can_use_a_metric_or_team_reward_in_place_of_rewards():
     def worth(fair):
         return fair.fortune
 
@@ -151,7 +151,7 @@ def test_a_metric_or_a_team_takes_the_place_of_rewards():
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
-def test_generators_of_the_process_are_copied_too(driver):
+def test_ledger_copies_the_global_generators(driver):
     class Thrown(Dice):
         reseed = None
 
@@ -175,7 +175,7 @@ def test_planners_and_variants_have_ledgers():
     assert frame["contribution"].tolist() == pytest.approx([7.0] * 3)
 
 
-def test_copies_do_not_repeat_the_warnings_of_the_episode(recwarn):
+def test_ledger_does_not_repeat_warnings_in_its_copies(recwarn):
     class Loud(Dice):
         def add(self):
             warnings.warn("loud", UserWarning, stacklevel=1)
@@ -187,7 +187,7 @@ def test_copies_do_not_repeat_the_warnings_of_the_episode(recwarn):
     assert [str(warning.message) for warning in recwarn] == ["loud"] * 3
 
 
-def test_the_episode_is_that_of_the_policies():
+def test_ledger_returns_match_the_plain_episode():
     for futures in (0, 2):
         found = ledger(Fair, POLICIES, seeds=[4], points=POINTS, futures=futures)
         assert found.returns[4] == pytest.approx(returns_of(Fair, POINTS, POLICIES, 4))
@@ -196,7 +196,7 @@ def test_the_episode_is_that_of_the_policies():
 # -- the rule decides once ------------------------------------------------------------------------
 
 
-def test_the_rule_decides_once_and_then_the_policy():
+def test_ledger_replaces_one_decision_by_the_rule_with_after_policy():
     found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, after="policy")
     assert len(found.frame) > 4
     for place, value in enumerate(found.frame["value"]):
@@ -211,7 +211,7 @@ def test_the_rule_decides_once_and_then_the_policy():
     assert found.frame["contribution"].tolist() == worth.tolist()
 
 
-def test_planted_mistakes_are_among_the_worst():
+def test_ledger_ranks_planted_mistakes_among_the_worst():
     mistakes = set(range(5, 95, 9))
 
     def careful(observation):
@@ -228,7 +228,7 @@ def test_planted_mistakes_are_among_the_worst():
 # -- skill and luck -------------------------------------------------------------------------------
 
 
-def test_skill_and_luck_are_apart():
+def test_ledger_separates_skill_from_luck():
     found = ledger(Dice, {"player_0": lambda seen: 5}, seeds=[1, 2], points=dice(), futures=6)
     frame = found.frame
     assert frame["skill"].tolist() == pytest.approx([3.0] * 6)  # chance is common
@@ -252,7 +252,7 @@ def test_value_skill_and_luck_add_up_to_the_return(seed):
     assert total.tolist() == pytest.approx([found.returns[seed]] * len(once))
 
 
-def test_where_nothing_is_random_all_is_skill():
+def test_deterministic_simulation_attributes_all_to_skill():
     class Fixed(Dice):
         deterministic = True
 
@@ -276,7 +276,7 @@ def test_where_nothing_is_random_all_is_skill():
 # -- the table ------------------------------------------------------------------------------------
 
 
-def test_the_frame_tells_decisions_in_words():
+def test_ledger_frame_describes_decisions_by_their_labels():
     policies = {AGENT: lambda seen: 1 - int(seen[1])}
     found = ledger(QueueSimulation, policies, seeds=[3, 4], max_steps=20)
     frame = found.frame
@@ -297,7 +297,7 @@ def test_the_frame_tells_decisions_in_words():
     assert summary["decisions"].iloc[0] == 20
 
 
-def test_boxes_and_the_rule_have_words_too():
+def test_ledger_frame_describes_box_actions_and_rule_decisions():
     policies = {WATERER: lambda seen: [0.06] if seen[3] < 0.02 else RULE}
     frame = ledger(GreenhouseSim, policies, seeds=[1], max_steps=4).frame
     assert (
@@ -346,13 +346,13 @@ def test_the_plot_marks_ten_decisions():
     assert ledger(nothing, {"player_0": boldest}, seeds=[1], points=dice()).plot().axes
 
 
-def test_a_long_ledger_says_so_beforehand(monkeypatch):
+def test_long_ledger_warns_of_its_duration_beforehand(monkeypatch):
     monkeypatch.setattr(ledgers, "LONG", 0.0)
     with pytest.warns(UserWarning, match=r"about \d+ minutes"):
         ledger(Dice, {"player_0": lambda seen: 1}, seeds=[1], points=dice())
 
 
-def test_wrong_arguments_are_refused():
+def test_ledger_refuses_invalid_arguments():
     given = {"seeds": [1], "points": dice()}
     policies = {"player_0": lambda seen: 1}
     for wrong, text in (

@@ -145,7 +145,7 @@ def test_classes_factories_and_variants_make_simulations(make, tmp_path):
 )
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
 @pytest.mark.parametrize("method", ["run", "close"])
-def test_whatever_ends_a_run_is_an_error_of_that_run(method, error, arguments, tmp_path):
+def test_exits_and_errors_that_end_a_run_become_its_error_row(method, error, arguments, tmp_path):
     def end(shop):
         getattr(Shop, method, lambda shop: None)(shop)
         if shop.seed == 1:
@@ -178,7 +178,7 @@ def test_an_interrupt_ends_the_experiment(batched, tmp_path):
     assert [line["seed"] for line in lines(tmp_path)] == [0, 1]
 
 
-def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
+def test_points_and_plugins_may_be_iterators(tmp_path):
     class Own(Shop):
         points = POINTS
 
@@ -236,7 +236,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
         {"status": "ok", "metrics": None, "provenance": None},
     ],
 )
-def test_a_line_that_is_no_run_is_a_run_that_is_missing(damage, tmp_path):
+def test_run_of_a_damaged_line_is_run_again(damage, tmp_path):
     def again():
         return run(tmp_path, {"days": [1]}, seeds=range(2), contenders=None)
 
@@ -270,7 +270,7 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
     assert again()["status"].tolist() == ["ok"] * 3
 
 
-def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
+def test_factors_and_metrics_keep_their_types_in_the_store(tmp_path):
     things = [1, 1.0, True, "1", "\u00e9\n", None, math.inf, -0.0, 0.1, 2**70]
     design = pd.DataFrame({"kind": pd.Series(things, dtype=object)})
     frame = run(tmp_path, design, contenders=None, seeds=[0], metric=lambda shop: shop.kind)
@@ -368,7 +368,7 @@ def test_stored_runs_of_other_definitions_are_warned_of(told, arguments, tmp_pat
         assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
-def test_a_row_that_is_known_to_fail_does_not_keep_others_from_being_run(tmp_path):
+def test_stored_failed_run_does_not_block_other_runs(tmp_path):
     def make(days):
         return Variant("v", Shop, parameters={"days": days} if days != 2 else {"nights": days})
 
@@ -443,7 +443,7 @@ def test_a_store_that_cannot_be_written_or_read_is_an_error(tmp_path):
         run(None)
 
 
-def test_a_store_is_where_its_user_is(tmp_path, monkeypatch):
+def test_relative_store_is_in_the_working_directory_of_the_user(tmp_path, monkeypatch):
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)  # where workers that were started before are not
@@ -518,7 +518,7 @@ def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path)
     assert frame["metric"].tolist() == 2 * alone
 
 
-def test_a_process_is_kept_only_while_it_would_be_started_alike(tmp_path, monkeypatch):
+def test_process_is_reused_only_with_same_environment_and_directory(tmp_path, monkeypatch):
     def make(name, folder):
         (tmp_path / folder).mkdir(exist_ok=True)
         monkeypatch.setenv("HARBOUR", name)
@@ -540,7 +540,7 @@ class Deadly(Shop):
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_path):
+def test_run_that_kills_its_worker_becomes_an_error_row(batched, tmp_path):
     given = {"design": {"days": [1, 2, 3]}, "contenders": None, "batched": batched}
     frame = run(tmp_path / "a", make=Deadly, workers=2, **given)
     whole = run(tmp_path / "b", **given)
@@ -563,7 +563,7 @@ def test_a_backend_that_hides_the_death_of_workers_is_refused_at_once(
     assert not (tmp_path / "store").exists()
 
 
-def test_integers_of_too_many_digits_are_errors_of_their_run_or_of_their_policy(tmp_path):
+def test_integers_with_too_many_digits_for_json_are_errors(tmp_path):
     frame = run(tmp_path / "metric", {"days": [1]}, metric=lambda shop: 10**5000)
     assert frame["error"].str.contains("cannot be stored as JSON").all()
     with pytest.raises(OptionValueError, match="cannot be stored as JSON"):
@@ -611,7 +611,7 @@ SCRIPT = """
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_path):
+def test_killed_process_loses_only_the_runs_in_progress(workers, tmp_path):
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
 

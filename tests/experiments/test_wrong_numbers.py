@@ -82,7 +82,7 @@ def test_unseeded_draws_from_global_generators_are_errors(kind, arguments):
 
 
 @pytest.mark.parametrize("kind", [SeededCasino, SeededNumpyCasino])
-def test_draws_after_seeding_are_errors_only_beside_other_runs(kind):
+def test_draws_after_seeding_are_errors_only_if_runs_are_interleaved(kind):
     assert fates(kind, BET) == FINE
     assert_errors(fates(kind, BET, batched=True), "influence each other")
     assert fates(kind, BET, batched=True, batch_size=1) == FINE
@@ -146,7 +146,7 @@ def stubborn(decide):
     return lambda: Script(main)
 
 
-def test_simulations_that_were_given_up_are_errors():
+def test_runs_of_simulations_that_refuse_to_unwind_are_errors():
     decide = decision(agent="chooser")
     found = fates(stubborn(decide), decide, max_steps=2, metric=lambda script: len(script.log))
     assert_errors(found, "refuses to end")
@@ -193,7 +193,7 @@ def test_the_warning_itself_comes_once():
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_trajectories_tell_which_episodes_are_wrong(workers):
+def test_trajectories_mark_episodes_with_wrong_numbers(workers):
     policies = {"gambler": RULE}
     for _ in range(2):
         found = collect_episodes(Casino, policies, seeds=SEEDS, points=BET, workers=workers)

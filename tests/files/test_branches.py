@@ -191,7 +191,7 @@ def test_a_branch_beside_other_simulations_is_refused(at_third, tmp_path):
     assert at_third(use, lambda: simulate_many(Pumps, {"pull": explore}, seeds=[3]))
 
 
-def test_no_game_goes_on_from_a_branch(at_third, tmp_path):
+def test_open_game_refuses_the_file_of_a_branch(at_third, tmp_path):
     at_third(lambda env: branch(env, partial(step, path=tmp_path / "a")), RUNS["aec"])
     with pytest.raises(EpisodeFileError, match="branch of a planner"):
         open_game(tmp_path / "a", None, Rules(""))

@@ -89,7 +89,7 @@ def test_a_reseeded_clone_is_saved_with_its_seed(tmp_path):
     assert future(load_episode(tmp_path / "a"), 1) == future(other, 1)
 
 
-def test_a_branch_is_saved(tmp_path):
+def test_branch_can_be_saved_as_an_episode_file(tmp_path):
     env = begun()
 
     def save(continuation, number):
@@ -101,7 +101,7 @@ def test_a_branch_is_saved(tmp_path):
     assert repr(load_episode(tmp_path / "branch").last()) == told
 
 
-def test_the_policies_of_the_file_answer_after_it_too(tmp_path):
+def test_policies_of_a_loaded_file_answer_later_decisions_too(tmp_path):
     env = begun(single_env, Pumps, points=None, agent="push", policies={"pull": steady})
     save_episode(env, tmp_path / "a")
     assert [line.get("by") for line in lines_of(tmp_path / "a")[1:4]] == [None, "policy", None]
@@ -143,7 +143,7 @@ def test_latest_is_the_result_of_the_last_reset_or_step(make, tmp_path):
     assert repr(load_episode(tmp_path / "a").unwrapped.latest) == repr(results)
 
 
-def test_plugins_are_named(tmp_path):
+def test_episode_files_store_plugins_by_name(tmp_path):
     env = begun(plugins=[(twice, f"{POINTS_OF}.Yard.plan", "after")])
     save_episode(env, tmp_path / "a")
     loaded = load_episode(tmp_path / "a")
@@ -158,7 +158,7 @@ def twice(yard, _result):
     """A handler."""
 
 
-def test_values_that_json_lacks_are_exact(tmp_path):
+def test_episode_files_store_float32_actions_exactly(tmp_path):
     env = begun(single_env, Pumps, points=None, agent="push", taken=0)
     env.step(np.array([0.1, -1 / 3], np.float32))
     env.step(np.array([1, 0], np.float32))
@@ -168,7 +168,7 @@ def test_values_that_json_lacks_are_exact(tmp_path):
     assert [line["action"]["dtype"] for line in decisions] == ["<f4", "<f4"]
 
 
-def test_a_file_is_small(tmp_path):
+def test_episode_file_is_small(tmp_path):
     env = begun(taken=0)
     for _ in range(30):
         env.step(None if env.terminations[env.agent_selection] else 3)
@@ -224,7 +224,7 @@ def test_a_definition_that_no_module_holds_is_refused(tmp_path):
     assert load_episode(tmp_path / "a", points=points).agent_selection == "planner"
 
 
-def test_other_environments_and_those_without_an_episode_are_refused(tmp_path):
+def test_save_refuses_environments_without_one_episode_of_their_own(tmp_path):
     with pytest.raises(NotResetError):
         save_episode(aec_env(YARD, POINTS), tmp_path / "a")
     env = vector_env(Pumps, num_envs=1)
@@ -325,7 +325,7 @@ def test_an_episode_that_ends_earlier_is_a_difference(tmp_path):
         load_episode(tmp_path / "a", max_steps=3)
 
 
-def test_options_may_replace_those_of_the_file(tmp_path):
+def test_options_of_load_episode_replace_options_of_the_file(tmp_path):
     save_episode(begun(driver="thread"), tmp_path / "a")
     assert load_episode(tmp_path / "a").unwrapped.driver == "thread"
     assert load_episode(tmp_path / "a", driver="greenlet").unwrapped.driver == "greenlet"
@@ -371,7 +371,7 @@ def test_after_an_error_the_file_leads_to_the_answer_before_it(tmp_path):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-def test_recorded_files_are_those_that_are_saved(make, tmp_path):
+def test_recorded_file_is_the_beginning_of_the_saved_file(make, tmp_path):
     env = begun(make, Pumps, points=None, record=tmp_path / "all")
     save_episode(env, tmp_path / "saved")
     [path] = (tmp_path / "all").iterdir()
@@ -398,7 +398,7 @@ def test_a_file_stays_after_an_error_and_the_note_names_it(tmp_path):
     assert "seen" in lines_of(path)[-1]
 
 
-def test_all_files_stay_if_all_are_wanted(tmp_path):
+def test_record_all_keeps_the_file_of_every_episode(tmp_path):
     env = aec_env(Pumps, record=tmp_path, record_all=True)
     for seed in (1, 2):
         env.reset(seed=seed)
@@ -446,7 +446,7 @@ def test_parts_without_a_name_are_refused_at_construction(tmp_path):
         aec_env(YARD, POINTS, record=3)
 
 
-def test_a_kill_leaves_a_file_that_goes_on(tmp_path):
+def test_record_file_after_a_kill_can_be_loaded_and_continued(tmp_path):
     code = f"""
 import os
 from tests.files.test_episodes import begun
@@ -460,7 +460,7 @@ os.kill(os.getpid(), 9)
 
 
 @pytest.mark.parametrize("left", [1, 5, 40])
-def test_a_torn_last_line_loses_one_decision(left, tmp_path):
+def test_torn_last_line_of_an_episode_file_loses_one_decision(left, tmp_path):
     env = begun(record=tmp_path, taken=9)
     [path] = tmp_path.iterdir()
     written = path.read_bytes()
@@ -504,7 +504,7 @@ def test_points_in_another_order_than_the_simulations_keep_it(tmp_path):
     assert repr(load_episode(tmp_path / "a").latest[0]) == repr(observation)
 
 
-def test_an_environment_that_moves_is_not_saved(tmp_path):
+def test_save_is_refused_while_a_step_or_reset_runs(tmp_path):
     found = []
 
     def use(observation):

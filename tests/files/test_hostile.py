@@ -44,13 +44,13 @@ folder = subprocess
     "thing",
     [Holder, Holder.method, Holder.made, holder, named, method, unnamed, touched, saved.yard],
 )
-def test_things_of_modules_have_names(thing):
+def test_module_level_objects_are_saved_by_name(thing):
     name = names_of([thing])[id(thing)]
     assert find(name) == thing
 
 
 @pytest.mark.parametrize("thing", [Holder().method, lambda: 1, Holder(), partial(Holder)])
-def test_other_things_have_none(thing):
+def test_objects_that_no_module_holds_have_no_name(thing):
     assert names_of([thing]) == {}
 
 
@@ -173,7 +173,7 @@ def test_files_without_an_episode_are_errors(content, tmp_path):
         load_episode(tmp_path / "a")
 
 
-def test_nothing_was_called(path):
+def test_refused_files_call_no_named_function(path):
     lines = lines_of(path)
     assert json.dumps(lines).count("pickle") == 0
     assert touched == []

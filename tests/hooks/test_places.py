@@ -101,7 +101,7 @@ def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
     hook.leave(getcurrent())
 
 
-def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
+def test_outside_simulation_masks_the_interceptors_of_the_stack(monkeypatch):
     here, told = getcurrent(), []
     stack = SimpleNamespace(leave_hooks=told.append, enter_hooks=lambda: told.append("entered"))
 
@@ -123,13 +123,13 @@ def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
 # -- names -----------------------------------------------------------------------------------------
 
 
-def test_private_names_are_found_as_they_are_written():
+def test_name_mangled_attributes_are_found_by_their_written_name():
     with handlers((lambda self: "taken", f"{__name__}._Hiding.__hidden", "instead")):
         assert _Hiding().look() == "taken"
     assert _Hiding().look() == "hidden"
 
 
-def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
+def test_error_in_an_imported_model_module_surfaces_unchanged(tmp_path, monkeypatch):
     (tmp_path / "broken_model.py").write_text("import no_such_package_at_all\n")
     (tmp_path / "raising_model.py").write_text("raise ZeroDivisionError\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -142,7 +142,7 @@ def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
 # -- set and put back ------------------------------------------------------------------------------
 
 
-def test_a_function_is_found_by_what_its_module_calls_it(monkeypatch):
+def test_function_is_found_under_its_attribute_name_in_the_module(monkeypatch):
     module, log = types.ModuleType("renaming_module"), []
     module.second = lambda: 1
     module.second.__module__ = module.__name__
@@ -189,7 +189,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised):
 # -- nothing stays behind --------------------------------------------------------------------------
 
 
-def test_models_of_points_and_of_targets_are_collected_with_these():
+def test_models_are_garbage_collected_with_their_points():
     references = []
     for _ in range(20):
 
@@ -226,7 +226,7 @@ def test_models_of_points_and_of_targets_are_collected_with_these():
     assert name not in registered()
 
 
-def test_modules_may_come_while_names_are_looked_for(monkeypatch):
+def test_modules_may_be_imported_while_names_are_looked_up(monkeypatch):
     class Lazy:
         """Stands in for a module that is imported as soon as something is asked of it."""
 

@@ -145,7 +145,7 @@ def telling(log, target, by=""):
 @EVERYWHERE
 @pytest.mark.parametrize("how", ["by name", "as itself"])
 @pytest.mark.parametrize(("name", "call", "result"), FORMS.values(), ids=FORMS)
-def test_whatever_is_importable_can_be_extended(name, call, result, how, with_handlers):
+def test_handlers_extend_anything_importable(name, call, result, how, with_handlers):
     log = []
     assert with_handlers(call, *telling(log, found(name, how))) == call() == result
     assert log == ["before", "after"]
@@ -180,7 +180,7 @@ def test_handlers_of_a_position_run_in_order_and_their_changes_chain(
 
 
 @EVERYWHERE
-def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(with_handlers):
+def test_handlers_get_arguments_as_passed_under_any_parameter_names(with_handlers):
     @expose_to_plugins
     def function(value, more=2, most=3):
         return value, more, most
@@ -196,7 +196,7 @@ def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(
 
 
 @EVERYWHERE
-def test_of_several_instead_the_latest_alone_runs_and_may_call_what_it_replaces(with_handlers):
+def test_latest_instead_handler_runs_alone_and_may_call_the_original(with_handlers):
     function, log = local(), []
     first = (lambda *args: "first", function, "instead")
     latest = (lambda value, more=0: function.__wrapped__(value, more) * 10, function, "instead")
@@ -283,7 +283,7 @@ POOL = expose_to_plugins([1, 2])
 
 
 @EVERYWHERE
-def test_an_exposed_list_is_one_in_all_respects_and_has_handlers_by_its_name_too(with_handlers):
+def test_exposed_list_is_a_list_and_takes_handlers_by_name(with_handlers):
     assert isinstance(POOL, list)
     assert not isinstance(POOL, collections.abc.Iterator)
     assert (len(POOL), POOL[0], 2 in POOL, POOL == [1, 2]) == (2, 1, True, True)
@@ -302,7 +302,7 @@ def test_an_exposed_list_is_one_in_all_respects_and_has_handlers_by_its_name_too
     assert [*POOL] == [1, 2]
 
 
-def test_iterators_stay_iterators():
+def test_exposed_iterator_stays_an_iterator():
     items = expose_to_plugins(iter([1, 2, 3]))
     assert expose_to_plugins(items) is items
     assert isinstance(items, collections.abc.Iterator)
@@ -386,7 +386,7 @@ def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
 # -- for a while ----------------------------------------------------------------------------------
 
 
-def test_blocks_and_removals_take_away_nothing_but_their_own():
+def test_handler_blocks_and_removals_remove_only_their_own_handlers():
     function, log = local(), []
 
     def see(value, more=0):
@@ -424,7 +424,7 @@ def test_blocks_and_removals_take_away_nothing_but_their_own():
     ("position", "target"),
     [("before", BID), ("after", BID), ("instead", BID), ("after_next", f"{HERE}.counting")],
 )
-def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generator(
+def test_handler_error_names_its_attachment_and_closes_the_generator(
     position, target, with_handlers
 ):
     def call():
@@ -442,7 +442,7 @@ def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generat
 
 
 @EVERYWHERE
-def test_an_error_of_the_function_is_its_own_and_no_handler_runs_after_it(with_handlers):
+def test_error_of_the_function_surfaces_and_no_handler_runs_after_it(with_handlers):
     function, log = local(), []
     with pytest.raises(TypeError) as caught:
         with_handlers(lambda: function("text", 1), *telling(log, function))
@@ -539,7 +539,7 @@ def test_a_handler_may_take_the_place_of_single_items_and_end_them():
 
 
 @EVERYWHERE
-def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_handlers):
+def test_coroutine_functions_stay_so_and_after_gets_the_awaited_result(with_handlers):
     name, log = f"{MARKET}.Trader.wire", []
 
     async def before(self, amount):
@@ -646,7 +646,7 @@ def says(word):
     return (lambda self: word, WORD, "instead")
 
 
-def test_plugins_apply_in_the_simulation_and_in_mappings_of_their_environment():
+def test_plugins_apply_in_simulation_and_mappings_of_their_environment():
     env = single_env(House, House.water, plugins=[says("mine")], render_mode="ansi")
     simulation = env.simulation
     assert env.reset()[0].tolist() == [4, 0]
@@ -750,7 +750,7 @@ def test_environments_may_be_collected_at_any_moment():
     assert found.interceptors == hook_of(choose).interceptors == {}
 
 
-def test_nothing_is_patched_but_while_there_is_an_environment():
+def test_functions_are_patched_only_while_an_environment_exists():
     before = vars(House)["word"]
     made = generate_env(House, House.water, plugins=[says("mine")])
     assert vars(House)["word"] is before
@@ -820,7 +820,7 @@ def test_handlers_run_around_the_decision(where):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_environments_that_open_and_close_in_any_order_do_not_disturb_each_other(seed):
+def test_environments_and_handlers_may_open_and_close_in_any_order(seed):
     random, live, log = Random(seed), [], []
     calls = {name: (call, result) for name, call, result in FORMS.values()}
 
@@ -861,7 +861,7 @@ def test_environments_that_open_and_close_in_any_order_do_not_disturb_each_other
         leave()
 
 
-def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_after():
+def test_decision_functions_may_be_exposed_before_or_after_decoration():
     def choose():
         return "rule"
 
@@ -880,7 +880,7 @@ def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_afte
     assert log == [4, 4]
 
 
-def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside(monkeypatch):
+def test_function_decorated_under_handlers_keeps_them_outside(monkeypatch):
     log = []
     monkeypatch.setattr(Trader, "bid", Trader.bid)  # which puts it back
     with handlers((lambda *args, **kwargs: log.append(1), BID, "before")):

@@ -99,7 +99,7 @@ HOME, CABIN = f"{__name__}.Home", f"{__name__}.Cabin"
     ],
     ids=plainly,
 )
-def test_points_may_be_named_in_all_forms(points, agents):
+def test_points_option_takes_all_documented_forms(points, agents):
     env = aec_env(home(), points)
     # in which the simulation calls them
     order = ["heat_0", "cool_0", "cooler_0", "air_0", "fan_0", "light_0"]
@@ -111,7 +111,7 @@ def test_points_may_be_named_in_all_forms(points, agents):
 @pytest.mark.parametrize(
     "points", [[Home.cool], f"{HOME}.cool", {Home.cool: define()}], ids=plainly
 )
-def test_without_points_the_simulation_names_them(points):
+def test_points_default_to_the_points_of_the_simulation(points):
     simulation = script(lambda simulation: [Home().heat(), Home().cool()])()
     simulation.points = points
     for source in (simulation, lambda: simulation):
@@ -119,7 +119,7 @@ def test_without_points_the_simulation_names_them(points):
         assert decisions(play(aec_env(source, Home.heat))) == ["heat_0"]
 
 
-def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch):
+def test_points_default_to_all_registered_ones_of_one_package(monkeypatch):
     registered = []
     monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: registered)
     with pytest.raises(UnknownPointError, match="there is no decision point"):
@@ -176,7 +176,7 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch
     ],
     ids=plainly,
 )
-def test_points_that_cannot_be_decided_are_refused_at_construction(points, error, match):
+def test_invalid_points_are_refused_at_construction(points, error, match):
     for make in (aec_env, generate_env):
         with pytest.raises(error, match=match):
             make(home(), points)
@@ -217,7 +217,7 @@ BASE, SUB = {BID: define(agent="trader_0")}, {f"{MARKET}.Broker.bid": define(age
 @pytest.mark.parametrize(
     "points", [(BASE, SUB), (SUB, BASE), (BASE | SUB, SUB), (SUB, BASE | SUB)], ids=plainly
 )
-def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
+def test_environments_of_a_base_class_and_a_subclass_coexist(points):
     def bids():
         return [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)]
 
@@ -258,7 +258,7 @@ def test_patches_last_until_the_last_environment_is_gone(name, end):
     assert vars(owner).get(attribute) is before
 
 
-def test_modules_that_are_imported_between_reset_and_step_decide_and_are_restored(monkeypatch):
+def test_modules_imported_in_mid_episode_are_patched_and_restored(monkeypatch):
     before, late = market.price, types.ModuleType("late_shop")
     monkeypatch.setitem(sys.modules, "late_shop", late)
     env = begun(
@@ -371,7 +371,7 @@ def test_threads_that_register_and_extend_functions_leave_each_other_alone(
 # -- in other processes ---------------------------------------------------------------------------
 
 
-def test_a_point_is_itself_again_where_it_is_and_comes_along_with_one_hook(monkeypatch):
+def test_unpacked_point_is_the_existing_one_or_brings_one_hook(monkeypatch):
     local = decision(agent="local_0")
     point = hook_of(Home.heat)
     assert unpack(pack(point)) is point
@@ -392,7 +392,7 @@ def test_functions_go_to_other_processes_by_name(monkeypatch):
     assert list(map(unpack, parcels)) == functions
 
 
-def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypatch):
+def test_notebook_definitions_are_sent_to_processes_by_value(monkeypatch):
     main = sys.modules["__main__"]
     monkeypatch.delattr(main, "__file__", raising=False)
     with monkeypatch.context() as notebook:
@@ -406,7 +406,7 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
 # -- dicts from functions -------------------------------------------------------------------------
 
 
-def test_dicts_from_functions_work_while_environments_live():
+def test_points_keyed_by_functions_work_while_environments_are_alive():
     """The class then has a wrapper, which is another key of the same point."""
     points = {Trader.bid: define(agent="old")}
     env = begun(aec_env(calling(lambda: Trader().bid("tea")), points))

@@ -63,7 +63,7 @@ def log_of(env):
     return env.simulation.log
 
 
-def test_a_new_environment_decides_in_the_new_functions(model):
+def test_new_environment_uses_the_redefined_functions(model):
     old = aec_env(model.Sim, points_of(model, *NAMES))
     assert log_of(old) == [3] * 5
     exec(MODEL, vars(model))
@@ -89,7 +89,7 @@ def test_an_old_environment_warns_of_functions_that_were_defined_again(model, na
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_old_function_as_a_key_is_told(model, name):
+def test_redefined_function_as_a_key_of_points_is_reported(model, name):
     owner, _, attribute = name.rpartition(".")
     points = {getattr(getattr(model, owner, model), attribute): define()}
     alive = model.Tank
@@ -103,7 +103,7 @@ def test_the_old_function_as_a_key_is_told(model, name):
         aec_env(model.Sim, points).reset()
 
 
-def test_points_that_a_new_definition_lacks_are_registered_no_more(model, monkeypatch):
+def test_points_missing_after_a_redefinition_are_unregistered(model, monkeypatch):
     monkeypatch.setattr("simenv_marl.decision.hooks", lambda: [*map(hook_of, decorated)])
     decorated = [model.Tank.heat, model.pick]
     alive = aec_env(model.Sim)

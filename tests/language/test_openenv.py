@@ -99,7 +99,7 @@ def test_an_unknown_seat_is_refused_before_it_is_served():
 # -- one seat -------------------------------------------------------------------------------------
 
 
-def test_a_seat_says_and_takes_what_the_environment_does():
+def test_seat_has_the_prompts_and_actions_of_the_environment():
     kind = seat(painting, name="shop")
     assert kind.__name__ == "shop"
     answer = kind.action_class
@@ -169,7 +169,7 @@ def sockets():
     return [file for file in files if file.startswith("socket:")]
 
 
-def test_64_sessions_at_once_play_as_one_by_one_and_leave_nothing():
+def test_64_concurrent_sessions_match_sequential_ones_and_leak_nothing():
     before = sockets()
     with served(watering) as url:
         alone = [play_in_session(url, number) for number in range(64)]

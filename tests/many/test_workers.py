@@ -63,14 +63,14 @@ def traces(**arguments):
 @pytest.mark.parametrize(
     "arguments", [{"seeds": range(9)}, {"seeds": [5, 3], "batch_size": 1}, {"seeds": []}], ids=str
 )
-def test_workers_find_the_same_in_the_same_order(arguments):
+def test_workers_give_the_same_results_in_the_same_order(arguments):
     assert traces(workers=2, **arguments) == traces(**arguments)
     assert os.getpid() not in simulate_many(
         calling(), workers=2, collect=lambda model: os.getpid(), **arguments
     )
 
 
-def test_collected_episodes_are_the_same():
+def test_workers_collect_the_same_episodes():
     policies = {
         Creature.act: lambda observations: (
             policy(observations),
@@ -159,7 +159,7 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
     assert vars(Creature)["act"] is before
 
 
-def test_errors_surface_as_themselves():
+def test_errors_in_workers_keep_their_type():
     class LocalError(Exception):
         """Of which workers cannot know by its name."""
 
@@ -258,7 +258,7 @@ def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, mo
     assert printed.split() == [b"interrupted"]
 
 
-def test_progress_is_shown_where_it_is_asked_for(capsys):
+def test_progress_option_shows_a_bar(capsys):
     for workers in (0, 2):
         traces(seeds=range(5), workers=workers, progress=True)
         assert "5/5" in capsys.readouterr().err
@@ -267,7 +267,7 @@ def test_progress_is_shown_where_it_is_asked_for(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkeypatch):
+def test_backends_without_generators_share_the_work_evenly(monkeypatch):
     class Silent(ThreadingBackend):
         supports_return_generator = False
 
@@ -410,7 +410,7 @@ def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
 
 
 @pytest.mark.parametrize("backend", ["loky", "threading"])
-def test_bar_moves_with_each_episode_of_a_worker(backend, capsys):
+def test_progress_bar_moves_with_each_episode_of_a_worker(backend, capsys):
     def asked(observation, *, _decision):
         return 5
 
@@ -424,7 +424,7 @@ def test_bar_moves_with_each_episode_of_a_worker(backend, capsys):
     assert numbers[-1] == 60
 
 
-def test_bar_counts_episodes_of_workers_that_cannot_reach_its_file(capsys, monkeypatch):
+def test_progress_bar_counts_workers_that_cannot_reach_its_file(capsys, monkeypatch):
     def update(bar, number=1):
         if threading.current_thread() is threading.main_thread():
             real(bar, number)

@@ -227,7 +227,7 @@ def test_a_decision_of_another_type_is_an_error_of_the_model(child, client):
 
 
 @CPP
-def test_a_model_may_ask_without_naming_its_rule(child):
+def test_client_may_ask_without_a_rule(child):
     child.begin(play="optional")
     assert child.act(1, 2) == ended(2.0)
     child.begin(play="optional")
@@ -248,7 +248,7 @@ def test_the_decision_of_a_rule_that_fails_is_null(child):
     assert child.decided == [1]
 
 
-def test_clients_send_what_entities_do_besides(child, client):
+def test_clients_send_updates_removals_and_expected_calls(child, client):
     entity = "12" if client.name == "Java" else 12
     call = {"point": "a", "args": {"level": 0.5}, "time": 1.5}
     assert [child.begin(play="reports"), *(child.receive() for _ in range(6))] == [
@@ -286,7 +286,7 @@ def test_a_rule_that_is_reported_and_decides_is_an_error(child):
 
 
 @CPP
-def test_pairs_in_braces_are_objects(child):
+def test_braced_pairs_in_cpp_are_json_objects(child):
     assert child.begin(play="objects") == ended({"a": 1, "b": {"c": "d"}, "e": [1, "f"]})
 
 
@@ -322,7 +322,7 @@ def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
 SEEDS = {"C++": (0, 2**64 - 1), "Java": (-(2**63), 2**63 - 1), "Python": (0, 2**31 - 1)}
 
 
-def test_seeds_arrive_and_one_that_is_none_is_drawn(child, client):
+def test_client_gets_its_seed_and_draws_one_if_it_is_null(child, client):
     least, most = SEEDS[client.name]
     for seed in (least, 7, most):
         assert child.begin(seed, play="seed") == ended(seed)
@@ -360,7 +360,7 @@ def test_a_stop_unwinds_the_model_which_is_silent_until_the_next_start(child, cl
     [("C++", False), ("C++", True), ("Java", True), ("Python", False), ("Python", True)],
     indirect=["client"],
 )
-def test_a_model_that_never_hears_is_ended(child, client, gone):
+def test_model_that_ignores_a_stop_is_ended(child, client, gone):
     child.begin(play="deaf")
     if gone:
         child.out.close()
@@ -374,7 +374,7 @@ def test_a_model_that_never_hears_is_ended(child, client, gone):
 
 @CPP
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
-def test_many_stops_leave_nothing_behind(child):
+def test_many_stops_do_not_grow_the_memory_of_the_client(child):
     resident = []
     for number in range(3_000):
         child.begin(play="count")
@@ -447,7 +447,7 @@ def test_an_option_of_another_type_is_an_error_that_names_it(child):
     )
 
 
-def test_the_longest_lines_go_both_ways(child):
+def test_lines_of_the_maximum_length_are_sent_and_received(child):
     text = "y" * (LONGEST - 100)
     assert len(child.begin(value=text)["args"]["value"]) == len(text)
     assert child.act(1, text) == ended(text)
@@ -530,7 +530,7 @@ def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
 @pytest.mark.parametrize(
     "closed", [["out"], ["into", "out"], ["into"]], ids=["input", "both", "output"]
 )
-def test_a_parent_that_is_gone_is_the_end(child, client, closed):
+def test_client_ends_when_the_pipes_of_its_parent_close(child, client, closed):
     if "into" in closed:
         child.begin(play="count")
     for end in closed:
@@ -578,7 +578,7 @@ INVALID = ["", "3,", "a,b", "3,4,5", "998,999"]
     ],
     indirect=["client"],
 )
-def test_descriptors_that_are_none_are_refused(client, said, text):
+def test_client_refuses_invalid_descriptors(client, said, text):
     done = plain(client, "echo", SIMENV_MARL_FDS=said)
     assert done.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
     assert text in done.stderr

@@ -51,7 +51,7 @@ def folder(env):
 
 
 @pytest.mark.greenlet("both drivers play episodes, one by one, below")
-def test_interleaved_runs_are_what_they_are_alone(make_env):
+def test_interleaved_runs_match_plain_runs(make_env):
     seeds = (3, 4, 5, 3)
     envs = [make_env(zones.raw_env) for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
@@ -110,7 +110,7 @@ def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
 
 @pytest.mark.greenlet("with threads there is no fork")
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_branches_go_on_exactly(make_env, method):
+def test_branches_continue_exactly(make_env, method):
     env = begun(make_env(zones.raw_env), 3)
     for _ in range(101):
         env.step(at(18.0))
@@ -128,7 +128,7 @@ def test_branches_go_on_exactly(make_env, method):
 
 
 @pytest.mark.greenlet("there is no environment")
-def test_the_model_runs_alone_and_a_policy_is_compared_with_its_time_switch(capfd):
+def test_model_runs_alone_and_its_policy_comparison_prints_a_result(capfd):
     house.main()
     assert "kWh" in capfd.readouterr().out
     policy.main(["--seeds", "2"])

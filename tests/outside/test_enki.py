@@ -31,7 +31,7 @@ def test_robots_join_in_pairs_and_leave_one_by_one(make_env):
     assert rounds == 240, "one for each half second"
 
 
-def test_robots_of_a_pair_are_paid_for_what_the_team_sweeps(make_env):
+def test_robots_of_a_pair_each_get_the_team_reward(make_env):
     env = make_env(robots.parallel_env)
     env.reset(seed=7, options={"seconds": 20.0})
     paid = {agent: [] for agent in env.agents}
@@ -44,7 +44,7 @@ def test_robots_of_a_pair_are_paid_for_what_the_team_sweeps(make_env):
 
 
 @pytest.mark.greenlet("the driver makes no difference to policies")
-def test_robots_that_follow_the_rule_sweep_more_than_those_that_go_straight_on():
+def test_robots_by_the_rule_sweep_more_than_robots_going_straight():
     contenders = {"rule": {}, "straight": {"robot.turn": lambda _: np.zeros(1, np.float32)}}
     swept = evaluate(
         robots.robots,

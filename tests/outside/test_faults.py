@@ -163,7 +163,7 @@ time.sleep(600)
 """
 
 
-def test_an_error_has_what_was_said_after_the_last_frame():
+def test_error_quotes_stderr_written_after_the_last_frame():
     process = Child([sys.executable, "-c", TALKS], 60.0)
     process.send(b"\n")
     assert select.select([process._stderr], [], [], 60.0)[0]
@@ -171,7 +171,7 @@ def test_an_error_has_what_was_said_after_the_last_frame():
         process.receive()
 
 
-def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
+def test_endless_stderr_does_not_delay_the_timeout(monkeypatch):
     monkeypatch.setattr(Child, "_read_stderr", lambda process: True)  # so that there is always more
     with pytest.raises(ProcessTimeoutError, match="sent nothing"):
         ProcessSimulation(["sleep", "600"], BOTH, timeout=1.0).reset()
@@ -185,7 +185,7 @@ def in_a_fork(check):
     assert process.exitcode == 0
 
 
-def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make_env):
+def test_forked_environment_can_reset_but_not_use_or_end_the_process(make_env):
     env = begun(make_env(aec_env, reservoirs()), 1)
     number = child(env)
 
@@ -208,7 +208,7 @@ def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make
     assert env.simulation.result == by_its_rule(1)
 
 
-def test_descriptors_and_processes_are_given_back():
+def test_descriptors_and_processes_are_released():
     alone(fail_many_times)
 
 
@@ -247,7 +247,7 @@ def fail_many_times():
     assert descriptors() == before
 
 
-def test_a_killed_process_is_not_taken_for_one_that_exited_where_its_exit_code_is_lost():
+def test_killed_process_with_a_lost_exit_code_is_an_error():
     alone(ignore_children)
 
 
@@ -278,7 +278,7 @@ while True:
 """
 
 
-def test_a_process_that_computes_ends_with_its_parent_though_that_is_killed():
+def test_busy_process_ends_when_its_parent_is_killed():
     parent = f"""
 import signal, threading
 from simenv_marl.remote.child import Child
@@ -298,7 +298,7 @@ signal.pause()
     assert all(map(gone, numbers))
 
 
-def test_processes_that_do_not_see_the_end_of_their_input_are_ended_together(monkeypatch):
+def test_unresponsive_processes_are_ended_in_one_grace_period(monkeypatch):
     clock = [0.0]
     env = begun(vector_env(reservoirs({"broker.price": PRICE}), "broker.price", num_envs=5), 1)
     numbers = [simulation._child.pid for simulation in env.get_attr("simulation")]

@@ -45,7 +45,7 @@ def heat(power):
 
 
 @KINDS
-def test_interleaved_episodes_are_the_plain_runs_though_others_are_given_up(make_env, kind):
+def test_interleaved_episodes_match_plain_runs_after_aborted_ones(make_env, kind):
     seeds, steps = (3, 4, 3), 192
     envs = [make_env(single_env, RoomSim(kind)) for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
@@ -64,7 +64,7 @@ def test_interleaved_episodes_are_the_plain_runs_though_others_are_given_up(make
 
 
 @NEEDS_C
-def test_all_units_are_the_same_room():
+def test_fmi2_fmi3_and_c_models_give_the_same_results():
     assert plain("fmi2", 3) == plain("fmi3", 3) == pytest.approx(plain("c", 3), rel=1e-12)
 
 
@@ -89,7 +89,7 @@ def test_a_clone_goes_on_exactly_without_the_units_own_states(make_env, kind, me
 
 @pytest.mark.greenlet("the driver makes no difference to the spaces")
 @KINDS
-def test_bounds_and_units_come_from_the_variable_or_its_type_or_from_the_user(kind):
+def test_bounds_and_units_come_from_the_variable_its_type_or_the_user(kind):
     description = read_model_description(unit(kind))
     names = ("power", *OBSERVED)
     if kind == "fmi2":

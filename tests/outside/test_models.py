@@ -71,7 +71,7 @@ pytestmark = [
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in MODELS])
-def test_by_its_rule_each_episode_is_the_plain_model_though_others_are_given_up(make_env, name):
+def test_rule_episodes_match_the_plain_model_after_aborted_ones(make_env, name):
     _, example, episodes = MODELS[name]
     env, processes = make_env(example.raw_env), set()
     for steps, (seed, options) in zip((0, 1, 40, 300), episodes, strict=True):
@@ -87,7 +87,7 @@ def test_by_its_rule_each_episode_is_the_plain_model_though_others_are_given_up(
 
 
 @needs("network")
-def test_the_code_of_the_page_runs(capsys):
+def test_code_of_the_ns3_page_runs(capsys):
     (code,) = blocks("ns3.md")
     exec(code, {"__name__": "page"})
     assert capsys.readouterr().out == f"{plain(network, 7, seconds=10)}\n"

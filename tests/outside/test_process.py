@@ -58,7 +58,7 @@ def _cheap(observation):
     return 0
 
 
-def test_rule_is_the_plain_run_and_one_process_plays_all_episodes(make_env):
+def test_rule_matches_the_plain_run_with_one_process_for_all_episodes(make_env):
     env = make_env(aec_env, reservoirs())
     numbers = set()
     for seed in range(3):
@@ -131,7 +131,7 @@ def test_policies_answer_by_agent_and_by_point(make_env):
     assert env.simulation.result["price"] == 2.0
 
 
-def test_points_may_be_given_other_definitions_and_apply_answers_with_what_it_returns(make_env):
+def test_points_may_be_redefined_and_the_result_of_apply_is_sent(make_env):
     answer = replace(
         PRICE, action_space_mapping=None, apply=lambda action, call: float(action) + call.total
     )
@@ -229,7 +229,7 @@ def test_other_futures_are_drawn_in_the_process(make_env):
     assert one == again != other
 
 
-def test_a_process_that_cannot_reseed_says_so():
+def test_process_that_cannot_reseed_raises_an_error():
     simulation = begun(
         ProcessSimulation([sys.executable, bare.__file__, "rate"], {"rate": PLAIN}), 1
     )
@@ -267,7 +267,7 @@ def test_many_simulations_share_a_process(started, make_env, tmp_path):
     assert number() == 6
 
 
-def test_processes_that_are_kept_end_with_what_has_run(started):
+def test_kept_process_ends_when_its_runner_returns_or_fails(started):
     numbers = []
 
     def notice(simulation):
@@ -326,7 +326,7 @@ def test_calls_can_be_copied():
         call["rain"]
 
 
-def test_what_is_no_json_is_refused_before_anything_is_sent(make_env):
+def test_values_that_are_no_json_are_refused_before_sending(make_env):
     env = begun(
         make_env(
             aec_env,
@@ -348,7 +348,7 @@ def test_what_is_no_json_is_refused_before_anything_is_sent(make_env):
     assert plays_by_its_rule(env)
 
 
-def test_options_of_a_simulation_that_are_none_are_refused():
+def test_process_simulation_refuses_invalid_options():
     for wrong in ([], [3], None, 7):
         with pytest.raises(OptionValueError, match="command"):
             ProcessSimulation(wrong, BOTH)
@@ -413,7 +413,7 @@ for line in commands:
     ],
     ids=str,
 )
-def test_an_episode_has_its_clock_whatever_its_first_frame_is(first):
+def test_time_is_known_from_any_kind_of_first_frame(first):
     seen = []
 
     def observe(call):

@@ -14,7 +14,7 @@ from tests.worlds.models import follow_the_rule
 pytestmark = pytest.mark.skipif(bool(ros.missing()), reason=ros.missing())
 
 
-def test_ten_of_ten_episodes_are_the_plain_run_although_others_are_given_up(make_env):
+def test_rule_episodes_match_the_plain_run_after_aborted_ones(make_env):
     env, found = make_env(ros.env), []
     for seed in range(5):
         for _ in range(2):

@@ -55,7 +55,7 @@ def test_the_rule_can_be_recorded_and_compared_with_policies():
     assert mixed["reservoir.inflow"].known.all()
 
 
-def test_actions_of_a_process_that_tells_nothing_stay_unknown():
+def test_rule_actions_are_unknown_if_the_process_sends_no_decided():
     policies = {"broker_0": lambda observations: np.zeros(len(observations), int)}
     with pytest.raises(DefinitionError, match="the action of the rule is not known"):
         compare_with_rule(
@@ -63,7 +63,7 @@ def test_actions_of_a_process_that_tells_nothing_stay_unknown():
         )
 
 
-def test_apply_may_ask_the_rule_and_leave_it_at_that():
+def test_apply_may_return_the_decision_of_the_rule():
     asked, late = [], []
 
     def apply(action, call, *, _rule):
@@ -77,7 +77,7 @@ def test_apply_may_ask_the_rule_and_leave_it_at_that():
     assert [rule(call) for rule, call in late] == [RULE] * len(asked), "no decision is due any more"
 
 
-def test_what_the_rule_has_decided_cannot_be_replaced():
+def test_apply_cannot_replace_a_decision_of_the_rule():
     definition = replace(
         PRICE, action_space_mapping=None, apply=lambda action, call, *, _rule: 2 * _rule(call)
     )
@@ -155,7 +155,7 @@ def speaking(*frames):
     ],
     ids=str,
 )
-def test_what_is_wrong_before_the_start_of_an_episode_is_an_error(frames, kind, text):
+def test_invalid_or_error_frames_before_the_start_are_errors(frames, kind, text):
     with pytest.raises(kind, match=text):
         simulate(speaking(*frames), seed=1)
 
@@ -171,7 +171,7 @@ def test_what_is_wrong_before_the_start_of_an_episode_is_an_error(frames, kind, 
     ],
     ids=str,
 )
-def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(frame, text):
+def test_wrong_frame_in_place_of_decided_is_named_in_an_error(frame, text):
     with pytest.raises(
         WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'
     ):
@@ -210,7 +210,7 @@ def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(
     ],
     ids=str,
 )
-def test_a_frame_that_is_invalid_or_not_due_is_an_error_that_names_it(frame, text):
+def test_invalid_or_unexpected_frame_is_named_in_an_error(frame, text):
     with pytest.raises(WireError, match=f"(?s){text}"):
         simulate(speaking(HELLO, CALL, DECIDED, frame), seed=1)
 
@@ -272,7 +272,7 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
     )
 
 
-def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):
+def test_removed_entity_is_not_expected_and_its_name_may_return(make_env):
     removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
     frames = CALL, DECIDED, expected("b"), *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
     names = {}
@@ -283,7 +283,7 @@ def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_e
     assert env.simulation.expected_calls("sheep.graze") == []
 
 
-def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
+def test_error_in_a_mapping_ends_a_process_that_is_not_waiting(make_env):
     rewards = [0.0]
     once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
     removed = {"remove": "a", "point": "sheep.graze"}

@@ -258,7 +258,7 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
     ],
     ids=range(20),
 )
-def test_wire_check_says_what_is_wrong_and_what_to_do(tmp_path, change, tried, text):
+def test_wire_check_reports_each_fault_and_its_remedy(tmp_path, change, tried, text):
     report = check_wire(changed(tmp_path, change), timeout=10.0)
     (finding,) = [finding for finding in report.findings if finding.tried == tried]
     assert finding.verdict == "wrong", str(report)
@@ -266,7 +266,7 @@ def test_wire_check_says_what_is_wrong_and_what_to_do(tmp_path, change, tried, t
     assert not report.ok
 
 
-def test_what_may_be_intended_is_noted(tmp_path, monkeypatch):
+def test_wire_check_notes_behaviour_that_may_be_intended(tmp_path, monkeypatch):
     monkeypatch.setenv(
         "NEEDED", "by the run without an environment, which is started in this one's"
     )

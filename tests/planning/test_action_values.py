@@ -115,7 +115,7 @@ def test_values_are_the_same_in_every_view_and_driver(view, driver, method):
 
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
-def test_values_in_mid_episode_are_those_of_the_pending_decision(view):
+def test_values_in_mid_episode_belong_to_the_pending_decision(view):
     env = made(view)
     for agent in ("left", "right", "left"):
         env.step(1 if view == "aec" else {agent: 1})
@@ -194,7 +194,7 @@ def test_joint_views_sum_up_and_have_joint_bases(method):
     assert action_values(env, actions, futures=3, method=method).returns == pytest.approx(-table)
 
 
-def test_policies_of_the_environment_stay():
+def test_policies_of_the_environment_take_precedence_over_the_base():
     stays = {"right": lambda observation: 2}
     env = made("aec", policies=stays)
     for base in (RULE, {"left": RULE, "right": lambda observation: 0}):
@@ -232,7 +232,7 @@ GRAZING = {
 @pytest.mark.parametrize(
     ("make", "others"), [(single_env, 1 + 3 + 5), (aec_env, 1 + 3 + 5), (parallel_env, 1 + 2 + 4)]
 )
-def test_others_at_the_same_point_follow_the_base_by_agent(make, others, method):
+def test_base_by_agent_decides_for_other_agents_of_the_same_point(make, others, method):
     """In a round by what they saw before it; in that in which they join, by the rule."""
     options = {"agent": "one"} if make is single_env else {}
     env = begun(make(Herd, GRAZING, **options), 1)
@@ -259,7 +259,7 @@ class Mortal(Duel):
 @METHODS
 @pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
-def test_agents_that_die_on_the_way(view, padded, method):
+def test_action_values_are_exact_if_the_agent_ends_in_a_future(view, padded, method):
     env, given = (
         made(view, Mortal),
         {"futures": 8, "base": lambda observation: 2, "terminal_value": lambda env: 1e6},
@@ -275,7 +275,7 @@ def test_agents_that_die_on_the_way(view, padded, method):
     assert action_values(env, **given, horizon=5).means.max() < 1e3
 
 
-def test_futures_are_those_of_the_decision():
+def test_futures_are_fixed_by_the_pending_decision_unless_seeded():
     env = made("single")
 
     def returns(env, **given):
@@ -296,7 +296,7 @@ def test_futures_are_those_of_the_decision():
 @METHODS
 @pytest.mark.parametrize("model", [Duel, Unseeded])
 @pytest.mark.filterwarnings("ignore:Unseeded cannot draw")
-def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
+def test_random_base_draws_the_same_numbers_for_all_candidates(model, method):
     def draws(observation):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 
@@ -319,7 +319,7 @@ def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
 
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
-def test_one_exact_future_and_a_warning(view, method):
+def test_simulation_without_reseed_has_one_future_and_a_warning(view, method):
     env = made(view, Unseeded)
     with pytest.warns(
         UserWarning, match="Unseeded cannot draw new random numbers .* foresees"
@@ -333,7 +333,7 @@ def test_one_exact_future_and_a_warning(view, method):
     )
 
 
-def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environment():
+def test_samples_for_wrappers_leave_the_action_space_generator_alone():
     space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
     env = begun(TransformAction(made("joint"), lambda action: action, space))
     drawn = copy.deepcopy(env.action_space["right"].np_random)
@@ -341,7 +341,7 @@ def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environme
     assert env.action_space["right"].np_random.random() == drawn.random()
 
 
-def test_wrappers_of_single_views_take_part():
+def test_planning_includes_wrappers_of_single_views():
     env = made("single")
     table = expected(env, "left", horizon=3)
     limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
@@ -374,7 +374,7 @@ class Doubled(BaseParallelWrapper):
 
 
 @METHODS
-def test_wrappers_of_pettingzoo_take_part_and_see_legal_actions(method):
+def test_planning_includes_pettingzoo_wrappers_and_gives_legal_actions(method):
     env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
@@ -417,7 +417,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("given", "error", "match"), WRONG)
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
-def test_invalid_arguments_are_refused(view, given, error, match):
+def test_action_values_refuse_invalid_arguments(view, given, error, match):
     env = made(view)
     with pytest.raises(error, match=match):
         action_values(env, **{"futures": 1} | given)
@@ -474,12 +474,12 @@ def test_a_time_limit_ends_branches_that_hang():
         )
 
 
-def test_progress_is_shown_on_request(capsys):
+def test_action_values_show_progress_on_request(capsys):
     assert action_values(made("single"), futures=3, progress=True).counts.tolist() == [3, 3, 3]
     assert "9/9" in capsys.readouterr().err
 
 
-def test_branches_are_not_shown():
+def test_branches_are_not_rendered():
     class Shown(Duel):
         render_modes = ("human",)
         pictures = 0
@@ -495,7 +495,7 @@ def test_branches_are_not_shown():
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
-def test_rounds_without_the_agent_belong_to_its_decision(wrapper):
+def test_rewards_of_rounds_without_the_agent_count_for_its_last_decision(wrapper):
     class Unannounced(Duel):
         def expected_calls(self, point):
             return []
@@ -516,7 +516,7 @@ def high(observation):
     [("aec", 1), ("parallel", 1), ("turn", 1), ("joint", {"left": 1, "right": 1})],
     ids=str,
 )
-def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
+def test_planner_used_as_the_base_of_another_agent_acts_by_its_own_base(view, candidate):
     plain, planned = (
         action_values(made(view), [candidate], base={"right": base}, futures=1).means.tolist()
         for base in (high, RolloutPolicy(base=high))
@@ -560,7 +560,7 @@ def test_planners_without_a_base_are_refused_as_bases(view, base):
 
 
 @METHODS
-def test_errors_come_as_themselves_and_say_which_candidate_was_tried_in_which_future(method):
+def test_errors_in_futures_keep_their_type_and_note_the_candidate(method):
     class Fragile(Duel):
         def run(self):
             return 1 / (self.left() - 2)

@@ -308,7 +308,7 @@ def patient(**given):
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_every_lets_the_choice_go_on_in_between(driver):
+def test_every_option_keeps_the_choice_between_planned_decisions(driver):
     planned = []
 
     class Counting(RolloutPolicy):
@@ -376,7 +376,7 @@ def test_a_new_episode_has_no_incumbent():
     assert planner.choose(env).actions == (short, RULE)
 
 
-def test_rule_and_incumbent_guard_against_worse_candidates():
+def test_planner_keeps_rule_or_incumbent_over_worse_candidates():
     env = one_agent()
     planner = patient(hold=None)
     planner.choose(env)

@@ -57,7 +57,7 @@ RUNS = {
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_a_long_run_says_once_what_a_decision_costs(run, tmp_path, monkeypatch, capfd):
+def test_long_run_reports_the_cost_of_a_decision_once(run, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.01)
     RUNS[run](tmp_path)
     said = SAID.findall(capfd.readouterr().err)
@@ -78,7 +78,7 @@ def stop(simulation):
     raise TimeoutError
 
 
-def test_a_long_run_in_workers_says_it_once(capfd):
+def test_long_run_in_workers_reports_the_cost_once(capfd):
     planner = RolloutPolicy([[0, 1], [1, 0]], futures=1, budget=5, every=12)
     # Workers of other tests would print elsewhere.
     joblib.externals.loky.get_reusable_executor().shutdown(wait=True)
@@ -90,7 +90,7 @@ def test_a_long_run_in_workers_says_it_once(capfd):
 
 
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_all_planners_say_it(kind, monkeypatch, capfd):
+def test_all_planners_report_the_cost_of_a_decision(kind, monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.01)
     planner = kind([[0, 1], [1, 0]], futures=4, horizon=2, every=6)
     simulate_many(Chance, {"push": planner}, seeds=[1, 2])
@@ -98,14 +98,14 @@ def test_all_planners_say_it(kind, monkeypatch, capfd):
     assert (candidates, futures) == ("3", "4")
 
 
-def test_a_short_run_and_a_single_simulation_say_nothing(monkeypatch, capfd):
+def test_short_runs_and_single_simulations_report_no_cost(monkeypatch, capfd):
     simulate_many(Slow, POLICIES, seeds=[1])
     monkeypatch.setattr(costs, "LONG", 0.0)
     simulate(Slow, POLICIES, seed=1)
     assert capfd.readouterr().err == ""
 
 
-def test_what_a_decision_costs_does_not_change_it(monkeypatch, capfd):
+def test_measuring_the_cost_of_a_decision_does_not_change_results(monkeypatch, capfd):
     before = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]
     monkeypatch.setattr(costs, "LONG", 0.0)
     after = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]

@@ -70,13 +70,13 @@ def share_of_rule(kind, model, margin, decisions):
     return sum(answer is RULE for answer in answers) / decisions
 
 
-def test_by_chance_alone_nearly_nothing_is_taken():
+def test_margin_rarely_lets_a_candidate_win_by_chance_alone():
     assert share_of_rule(RolloutPolicy, world(shared=True), 4.0, 12) >= 0.9
     assert 0.2 <= share_of_rule(RolloutPolicy, world(shared=True), 0.0, 12) <= 0.85
 
 
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_what_is_not_better_than_the_rule_is_not_taken(kind):
+def test_candidates_no_better_than_the_rule_are_not_taken(kind):
     assert share_of_rule(kind, world(gain=0.01), 1.0, 3) == 0.0  # the same noise meets all
     assert share_of_rule(kind, world(gain=-0.01), 0.0, 3) == 1.0
     assert share_of_rule(kind, world(), 0.0, 3) == 1.0
@@ -84,7 +84,9 @@ def test_what_is_not_better_than_the_rule_is_not_taken(kind):
 
 @pytest.mark.parametrize(("futures", "fresh"), [(3, 8), (12, 12)])
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_fresh_futures_compare_it_with_the_rule(kind, futures, fresh, monkeypatch):
+def test_best_candidate_is_compared_with_the_rule_on_fresh_futures(
+    kind, futures, fresh, monkeypatch
+):
     calls, branch = [], rollouts.branch
 
     def noted(*given, seeds, **options):
@@ -104,7 +106,7 @@ def test_fresh_futures_compare_it_with_the_rule(kind, futures, fresh, monkeypatc
 
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
 @pytest.mark.filterwarnings("ignore:SomeWorld cannot draw")
-def test_any_gain_in_one_exact_future_is_taken(kind):
+def test_margin_is_ignored_if_there_is_one_exact_future(kind):
     for gain, best in ((1e-6, 1), (0.0, RULE), (-1e-6, RULE)):
         assert (
             kind(actions=[1, 0], horizon=1, margin=1e9)
@@ -167,7 +169,7 @@ DOUBTFUL = [
 
 
 @pytest.mark.parametrize(("match", "model", "options", "given"), DOUBTFUL)
-def test_futures_that_tell_little_are_warned_of_once(match, model, options, given):
+def test_uninformative_futures_are_warned_of_once(match, model, options, given):
     env = made(model, **options)
     with pytest.warns(UserWarning, match=match) as caught:
         action_values(env, **{"futures": 16, "horizon": 1, "method": "replay"} | given)

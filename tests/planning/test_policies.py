@@ -114,7 +114,7 @@ def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
     assert counts.min() >= 1
 
 
-def test_candidates_of_a_round_meet_the_same_futures(wide):
+def test_rollout_candidates_of_a_budget_round_share_their_futures(wide):
     told = RolloutPolicy([2, 2, 2, RULE], budget=32, method="replay").choose(wide)
     assert told.counts.tolist() == [12, 12, 4, 4]
     assert told.returns[0].tolist() == told.returns[1].tolist()
@@ -145,7 +145,7 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
 @pytest.mark.parametrize(
     ("down", "method", "batch_size"), [(False, "replay", 1), (True, "replay", 8), (True, "fork", 8)]
 )
-def test_many_episodes_ask_row_by_row(down, method, batch_size):
+def test_planners_in_simulate_many_decide_row_by_row(down, method, batch_size):
     """Beside policies that are asked in batches, also in branches."""
     given = {
         "points": tame(),
@@ -258,7 +258,7 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
             assert came_to == min(turn + 1, 5)
 
 
-def test_entities_plan_each_for_itself():
+def test_each_entity_plans_for_its_own_return():
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(
         Herd, {point: RolloutPolicy(futures=1, method="replay")}, points=GRAZING, seed=1
@@ -267,7 +267,7 @@ def test_entities_plan_each_for_itself():
 
 
 @METHODS
-def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
+def test_policies_that_branch_do_not_recurse_into_each_other(method):
     """In a branch of one agent, the other follows its base or its rule: branches do not nest."""
     calls, seen, plans = [], [], []
 
@@ -339,7 +339,7 @@ def choice(planner, model=Lock, given=None):
 
 @METHODS
 @pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
-def test_two_decisions_that_are_worth_something_together(method):
+def test_tree_search_finds_two_decisions_that_pay_only_together(method):
     tree = TreeSearchPolicy(futures=10, exploration=1.4, method=method)
     rollouts = RolloutPolicy(futures=2, method=method)
     told = choice(tree)
@@ -355,7 +355,7 @@ def test_two_decisions_that_are_worth_something_together(method):
 
 
 @pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
-def test_actions_that_are_masked_by_then_are_left_to_the_base():
+def test_tree_search_leaves_masked_later_actions_to_the_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
     told = choice(TreeSearchPolicy(futures=10), given=given)
     assert (told.best, told.counts.sum()) == (RULE, 50)
@@ -388,7 +388,7 @@ class Lends(Unseeded):
     ("model", "most", "cost"),
     [(Opens, 200, 0), (Lends, 200, 0), (Unseeded, 3, 0), (Unseeded, 200, 1e9)],
 )
-def test_states_that_a_search_keeps_change_no_value_and_are_closed(model, most, cost, monkeypatch):
+def test_states_cached_by_a_search_change_no_value_and_are_closed(model, most, cost, monkeypatch):
     twins = []
 
     def noted(*given, **options):
@@ -423,7 +423,7 @@ def test_tree_searches_count_the_rewards_of_wrappers(monkeypatch):
     assert found.best == replayed.best
 
 
-def test_agents_that_end_before_the_depth():
+def test_tree_search_works_if_the_agent_ends_before_the_depth():
     class Short(Duel):
         ceiling = 2.5
 
@@ -471,7 +471,7 @@ def test_policies_plan_and_play_clones_up_to_the_end(policy, monkeypatch):
         over = any(single.step(action)[2:4])
 
 
-def test_candidates_meet_the_same_futures():
+def test_tree_search_candidates_share_their_futures():
     env = made("single")
     table = TreeSearchPolicy([1, 1], depth=1, futures=6).choose(env).returns
     both = ~np.isnan(table).any(axis=0)
@@ -490,7 +490,7 @@ def test_candidates_meet_the_same_futures():
         ("margin", [-1, float("nan"), None]),
     ],
 )
-def test_invalid_options_are_refused(option, values):
+def test_planners_refuse_invalid_options(option, values):
     for value in values:
         with pytest.raises(OptionValueError, match=option):
             TreeSearchPolicy(**{option: value})

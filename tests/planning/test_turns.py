@@ -46,7 +46,7 @@ def rising(seen, info):
 @pytest.mark.parametrize(
     "given", [{}, {"horizon": 1}, {"horizon": 4, "discount": 0.5}, {"discount": 0.9}]
 )
-def test_values_are_those_of_clones_that_are_stepped_by_hand(base, given, method):
+def test_values_match_clones_that_are_stepped_by_hand(base, given, method):
     env = made()
     for _ in range(3):  # up to a decision of the one on the right
         env.step(2)
@@ -65,7 +65,7 @@ def test_values_are_those_of_clones_that_are_stepped_by_hand(base, given, method
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_values_among_births_and_deaths_are_those_by_hand(flatten):
+def test_values_with_births_and_deaths_match_stepping_by_hand(flatten):
     class Yard(yards.Yard):
         def reseed(self, seed):
             self.random.seed(seed)
@@ -111,7 +111,7 @@ def paced(seen):
 
 
 @pytest.mark.parametrize("view", ["turn", "aec", "parallel", "joint"])
-def test_a_base_for_all_agents_decides_as_bases_by_agent_do(view):
+def test_base_for_all_agents_matches_bases_by_agent(view):
     bases = [
         dict.fromkeys(("left", "right"), paced),
         turn_policy(lambda seen: paced(seen["observation"]), like=made()),
@@ -197,7 +197,7 @@ def test_candidates_are_the_legal_actions_of_the_one_that_decides():
 
 
 @METHODS
-def test_wrappers_of_turn_views_take_part(method):
+def test_planning_includes_wrappers_of_turn_views(method):
     env = made()
     seeds = futures_of(env, 2)
     table = [

@@ -48,7 +48,7 @@ def test_a_pending_decision_is_described_in_words():
     ]
 
 
-def test_it_is_described_as_json():
+def test_pending_decision_is_described_as_json():
     found = describe(env_of(), as_json=True)
     assert json.loads(json.dumps(found)) == {
         "agent": "filler",
@@ -85,7 +85,7 @@ def test_every_view_and_its_clones_are_described_alike(view):
         twin.close()
 
 
-def test_what_a_policy_gets_is_described_as_the_environment_is():
+def test_describe_of_a_decision_equals_that_of_its_environment():
     said = []
 
     def policy(observation, *, _decision):
@@ -179,7 +179,7 @@ SAID = {
 @pytest.mark.parametrize(
     ("labels", "said"), [(labels, said) for labels in SAID for said in SAID[labels]]
 )
-def test_a_text_names_one_legal_action_or_an_error_lists_them(labels, said):
+def test_parse_returns_one_legal_action_or_an_error_lists_them(labels, said):
     mask = [not label.startswith("[") for label in labels]
     texts = [label.strip("[]") for label in labels]
     env = env_of(
@@ -257,7 +257,7 @@ def test_actions_without_a_label_have_their_decision_or_number(labels, decisions
     assert describe(env, as_json=True)["actions"]["enum"] == enum
 
 
-def test_labels_may_be_made_for_each_call():
+def test_action_labels_may_be_a_callable_of_the_call():
     env = env_of(
         replace(
             FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]
@@ -315,7 +315,7 @@ SPACES = {
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_actions_of_other_spaces_are_said_as_json_and_wrong_components_are_illegal(kind):
+def test_actions_of_other_spaces_are_parsed_from_json(kind):
     space, labels, texts, action = SPACES[kind]
     env = env_of(filling(space, action_labels=labels))
     for text in texts:
@@ -364,7 +364,7 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
         schema(spaces.Box(0, 1, (2, 2)))
 
 
-def test_parts_of_an_observation_have_their_labels():
+def test_components_of_an_observation_are_described_by_their_labels():
     definition = replace(
         FILL,
         observation_space=spaces.Dict(
@@ -383,7 +383,7 @@ def test_parts_of_an_observation_have_their_labels():
     ("f4", ["- a: 16777218", "- b: 0.1", "- c: 0.33333334", "- d: 2"]),
     ("f8", ["- a: 16777217.5", "- b: 0.1", "- c: 0.3333333333333333", "- d: 2"]),
 ])  # fmt: skip
-def test_numbers_lose_no_digit_that_matters(dtype, lines):
+def test_descriptions_keep_all_significant_digits_of_numbers(dtype, lines):
     definition = replace(
         FILL,
         observation_space=spaces.Box(-np.inf, np.inf, (4,), dtype),

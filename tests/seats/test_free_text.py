@@ -50,12 +50,12 @@ def test_any_text_up_to_its_length_is_in_the_space():
 
 
 @pytest.mark.parametrize("number", [0, -1, 1.5, "9"])
-def test_its_length_is_a_positive_integer(number):
+def test_free_text_length_must_be_a_positive_integer(number):
     with pytest.raises(OptionValueError, match="n must be an integer of at least 1"):
         free_text(number)
 
 
-def test_it_is_described_as_free_text(env):
+def test_free_text_action_is_described_with_its_length(env):
     assert describe(env).endswith("Legal actions:\n- any text of at most 40 characters")
     schema = describe(env, as_json=True)["actions"]
     assert schema == {"type": "string", "maxLength": 40}
@@ -74,7 +74,7 @@ def test_it_is_described_as_free_text(env):
         ("3", "3"),
     ],
 )
-def test_an_answer_is_the_text_or_its_action(env, text, action):
+def test_free_text_answer_is_parsed_as_text_or_as_its_action(env, text, action):
     assert parse(env, text) == action
 
 
@@ -108,14 +108,14 @@ class Lazy:
 LAZY = {"one": Lazy()}
 
 
-def test_a_file_is_written_beside_modules_that_load_when_looked_at(env, tmp_path):
+def test_episode_file_is_written_despite_lazily_loaded_modules(env, tmp_path):
     LAZY.pop("loaded", None)
     env.step("yes")
     save_episode(env, tmp_path / "episode")
     assert "loaded" in LAZY
 
 
-def test_it_is_an_observation_too():
+def test_free_text_may_be_an_observation():
     points = {
         Tank.fill: FILL,
         Tank.drain: replace(
@@ -135,6 +135,6 @@ def test_it_is_an_observation_too():
         turn_env(Tank, points)
 
 
-def test_a_simulation_with_free_text_has_no_fault():
+def test_check_finds_nothing_in_a_simulation_with_free_text():
     report = check_simulation(partial(Tank), POINTS, episodes=2)
     assert "error" not in {finding.severity for finding in report.findings}

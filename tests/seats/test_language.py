@@ -74,7 +74,7 @@ def test_numbers_are_checked_against_their_bounds_here_as_well():
     assert "number from 0 to 2" in requests[1]["messages"][-1]["content"]
 
 
-def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parsed():
+def test_wrong_answer_is_corrected_in_the_conversation():
     parts = [{"type": "text", "text": "Op"}, {"type": "thought"}, {"type": "text", "text": "en"}]
     with endpoint([says("ajar"), says(parts)]) as (address, requests):
         assert played(model(address))[0] == played(lambda observation: 2)[0]
@@ -114,7 +114,7 @@ def test_a_lasting_failure_is_an_error_and_a_fallback_answers(answer, kind, erro
     assert len(requests) == 12
 
 
-def test_a_missing_key_is_told_of_and_a_refused_one_is_not_tried_again(monkeypatch):
+def test_missing_api_key_is_an_error_and_a_refused_one_is_not_retried(monkeypatch):
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     with pytest.raises(LanguageModelError, match="api_key"):
         played(LanguageModelPolicy("fake", base_url="http://127.0.0.1:9/v1"))
@@ -203,7 +203,7 @@ def test_a_policy_that_is_sent_to_another_process_decides_there():
         assert played(policy) == played(pickle.loads(pickle.dumps(policy)))
 
 
-def test_a_client_of_the_user_and_own_words_are_taken():
+def test_language_policy_takes_a_custom_client_and_instructions():
     asked = []
 
     async def create(**request):
@@ -232,7 +232,7 @@ def test_the_prompt_of_a_pending_decision_is_shown():
     assert found.endswith(describe(env))
 
 
-def test_without_the_package_the_error_names_the_extra(monkeypatch):
+def test_language_policy_without_openai_names_the_missing_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "openai", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[language\]"):
         played(LanguageModelPolicy("fake"))

@@ -56,7 +56,7 @@ def test_a_question_defaults_to_the_first_sentence_of_the_rule(monkeypatch, doc,
     assert decisions(POINTS)[0].question == question
 
 
-def test_a_display_is_made_when_it_is_read_and_once():
+def test_display_mapping_is_called_only_when_read_and_once():
     calls = []
 
     def display(tank):
@@ -77,7 +77,7 @@ def test_a_display_is_made_when_it_is_read_and_once():
     assert calls == [0, 1, 2, 3, 4]
 
 
-def test_a_display_has_the_values_of_the_call():
+def test_display_mapping_is_called_with_the_arguments_of_the_call():
     seen = shown(display_mapping=lambda tank: {"level": tank.level, "day": str(tank.day)})
     assert seen[0] == ("By its rule: Choose how much water flows in.", {"level": 5.0, "day": "0"})
     assert shown()[0][1] is None
@@ -122,7 +122,7 @@ def test_items_of_a_split_call_have_questions():
         ("display_mapping", lambda tank: {0: tank.level}),
     ],
 )
-def test_values_that_are_no_texts_are_refused(part, value):
+def test_questions_and_displays_that_are_no_texts_are_refused(part, value):
     with pytest.raises(DefinitionError, match=f"{part} of .*fill has returned"):
         shown(**{part: value})
     report = check_simulation(Tank, {Tank.fill: replace(FILL, **{part: value})})

@@ -54,7 +54,7 @@ def raises(observation):
 
 
 @pytest.mark.parametrize("kind", [Asked, Waiting])
-def test_a_recording_repeats_its_seeds_without_one_call(kind, path):
+def test_recording_repeats_its_seeds_without_calling_the_policy(kind, path):
     first = kind()
     recorded = levels(RecordedPolicy(first, path), range(4))
     assert first.times == len(lines_of(path)) == 20
@@ -67,7 +67,7 @@ def test_a_recording_repeats_its_seeds_without_one_call(kind, path):
     assert second.times == 5  # those of the new seed
 
 
-def test_a_torn_last_line_costs_that_line(path):
+def test_torn_last_line_of_a_recording_loses_only_that_answer(path):
     def asked_again():
         policy = Asked()
         assert played(RecordedPolicy(policy, path)) == played(Asked())
@@ -123,7 +123,7 @@ def nested(outer, policy, path, **options):
 
 @pytest.mark.parametrize("policy", [unreliable, slow])
 @pytest.mark.parametrize("outer", [FallbackPolicy, RecordedPolicy])
-def test_both_nestings_repeat_a_run_with_its_fallbacks(policy, outer, path):
+def test_fallback_and_recording_repeat_a_run_in_either_nesting(policy, outer, path):
     def run(outer, policy):
         decided, guarded = nested(outer, policy, path, retries=1)
         found = evaluate(Tank, {"guarded": {"filler": decided}}, seeds=range(3), points=POINTS)
@@ -141,7 +141,7 @@ def test_both_nestings_repeat_a_run_with_its_fallbacks(policy, outer, path):
     assert all(line["why"] for line in by_fallback)
 
 
-def test_extras_are_repeated(path):
+def test_recording_repeats_extras_of_a_policy(path):
     def sure(observation):
         return 1, {"confidence": np.float32(observation[0]), "votes": np.array([1, 2])}
 
@@ -190,7 +190,7 @@ def test_an_episode_with_other_legal_actions_is_refused(path):
             played(RecordedPolicy(Asked(), path), points={Tank.fill: replace(FILL, **part)})
 
 
-def test_a_longer_episode_is_continued(path, monkeypatch):
+def test_recording_is_continued_if_the_episode_is_longer(path, monkeypatch):
     played(RecordedPolicy(Asked(), path))
     monkeypatch.setattr(Tank, "days", 8)
     policy = Asked()

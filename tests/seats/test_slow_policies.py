@@ -84,14 +84,14 @@ def test_a_coroutine_function_answers_as_a_function_does(run, plain):
     lambda policy: policy, FallbackPolicy, lambda policy: RecordedPolicy(policy, os.devnull),
     partial(FallbackPolicy, batched),  # which fails
 ])  # fmt: skip
-def test_extras_may_stand_beside_actions_wherever_policies_answer(run, wrap):
+def test_policies_may_return_extras_in_every_runner(run, wrap):
     async def later(observation):
         return await slow(observation), {"odds": 0.5}
 
     assert run(wrap(later)) == run(slow)
 
 
-def test_an_action_that_looks_like_an_action_with_extras_is_an_action():
+def test_tuple_action_is_not_mistaken_for_an_action_with_extras():
     pair = spaces.Tuple([spaces.Discrete(3), spaces.Dict({"odds": spaces.Discrete(2)})])
     seen = []
     points = {Tank.fill: filling(pair, lambda action: seen.append(action) or 1.0)}
@@ -106,7 +106,7 @@ def test_an_action_that_looks_like_an_action_with_extras_is_an_action():
         Tank, {"it": {"filler": policy}}, seeds=range(6), points=POINTS, concurrency=4
     ),
 ])  # fmt: skip
-def test_as_many_decisions_wait_at_once_as_concurrency_says(run):
+def test_concurrency_limits_how_many_decisions_wait_at_once(run):
     waiting, most = 0, 0
 
     async def counted(observation):
@@ -137,7 +137,7 @@ def test_quick_policies_are_asked_in_batches_beside_slow_ones():
     assert sum(sizes) == 6 * Tank.days
 
 
-def test_evaluations_and_experiments_of_slow_policies_are_those_of_quick_ones(tmp_path):
+def test_slow_policies_give_the_results_of_quick_policies(tmp_path):
     contenders, seeds = {"slow": {"filler": slow}, "quick": {"filler": quick}}, range(6)
     values = evaluate(Tank, contenders, seeds=seeds, points=POINTS, concurrency=5).values()
     assert (values["slow"] == values["quick"]).all()
@@ -219,7 +219,7 @@ def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
     assert sorted(cancelled) == [0, 1, 2, 3]
 
 
-def test_clients_keep_their_event_loop_from_call_to_call():
+def test_coroutine_policies_run_on_one_event_loop_in_all_calls():
     loops = set()
 
     async def noting(observation):
@@ -259,7 +259,7 @@ async def illegal(observation):
         (illegal, InvalidActionError, "action 9"),
     ],
 )
-def test_policies_that_cannot_be_awaited_are_told_what_to_do(policy, error, match):
+def test_policies_that_cannot_be_awaited_raise_error_with_a_remedy(policy, error, match):
     with pytest.raises(error, match=match):
         played(policy)
 
@@ -315,7 +315,7 @@ def test_a_policy_gets_the_pending_decision(waits, many):
     assert not first.in_clone
 
 
-def test_what_a_policy_does_to_its_decision_changes_nothing_else():
+def test_changes_of_a_policy_to_its_decision_affect_nothing_else():
     def spoil(observation, *, _decision):
         assert _decision.observation_labels == {"level": "Level"}
         before = float(observation["level"][0])
@@ -361,7 +361,7 @@ def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
 # -- in clones ------------------------------------------------------------------------------------
 
 
-def test_bases_that_wait_are_the_rule_and_those_that_ask_get_the_decision():
+def test_bases_that_are_coroutines_are_replaced_by_the_rule():
     async def never(observation):
         raise AssertionError("it is asked in a branch")
 

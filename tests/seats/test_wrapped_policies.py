@@ -140,7 +140,7 @@ def planner(observation, *, _environment):
         ((illegal, lambda observation, *, _environment: 1), one, {"illegal": 5, "fallbacks": 5}),
     ],
 )
-def test_policy_and_fallback_may_be_whatever_decides(arguments, plain, faults):
+def test_fallback_policy_takes_every_kind_of_policy_and_rule(arguments, plain, faults):
     guarded = FallbackPolicy(*arguments, timeout=60)
     assert played(guarded) == played(plain)
     assert guarded.counts == counted(asked=5, **faults)
@@ -156,7 +156,7 @@ def test_an_illegal_answer_of_the_fallback_is_an_error():
     {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"},
     {"retries": -1}, {"retries": True},
 ])  # fmt: skip
-def test_what_cannot_be_used_is_refused_at_once(arguments, tmp_path):
+def test_invalid_arguments_are_refused_at_construction(arguments, tmp_path):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):
         FallbackPolicy(**{"policy": raises, **arguments})
     with pytest.raises(DefinitionError, match="keyword-only"):
@@ -212,7 +212,7 @@ def test_fallbacks_are_a_share_of_the_decisions_of_their_policy():
     }  # fmt: skip
 
 
-def test_contenders_with_many_fallbacks_are_marked():
+def test_summary_marks_contenders_with_many_fallbacks():
     contenders = {
         "bad": {"filler": FallbackPolicy(raises)},
         "good": {"filler": FallbackPolicy(one)},
@@ -250,7 +250,7 @@ def then_the_rule(observation, *, _decision):
         (FallbackPolicy(illegal_later, two), two),
     ],
 )
-def test_in_clones_and_branches_nobody_waits_and_nothing_is_counted(policy, plain, method):
+def test_clones_and_branches_use_fallbacks_and_count_nothing(policy, plain, method):
     def begun(policy):
         env = single_env(Tank, POINTS, agent="drainer", policies={"filler": policy})
         env.reset(seed=1)

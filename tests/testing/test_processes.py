@@ -19,7 +19,7 @@ def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
         assert "seed 4" in seen.evidence
 
 
-def test_sets_that_are_sorted_and_values_of_a_process_are_sound():
+def test_check_accepts_sorted_sets():
     report = checked(sets.Ordered)
     assert not report.of("error")
     assert any("six hash seeds" in line for line in report.checked)

@@ -93,11 +93,11 @@ class Lazy(Walk):
         return self.random.choice([-1, 0, 1])
 
 
-def test_a_rule_may_draw_and_store_what_it_computes():
+def test_rule_that_draws_and_caches_passes_the_check():
     sound(Lazy)
 
 
-def test_an_apply_may_change_what_its_rule_changes():
+def test_apply_may_change_the_attributes_that_its_rule_changes():
     class Applied(Serves):
         pass
 
@@ -108,7 +108,7 @@ def test_an_apply_may_change_what_its_rule_changes():
     sound(Applied, {"action_space_mapping": None, "apply": take})
 
 
-def test_a_fingerprint_tells_what_a_rule_may_change():
+def test_fingerprint_leaves_out_attributes_that_a_rule_may_change():
     sound(Counts, fingerprint=lambda walk: walk.place)
 
 
@@ -139,7 +139,7 @@ class Clocked(Walk):
         return self.clock.now
 
 
-def test_a_generator_that_waits_for_nothing_is_sound():
+def test_check_accepts_generator_points_that_do_not_wait():
     sound(Clocked)
 
 
@@ -153,7 +153,7 @@ class Hesitates(Clocked):
         return 1
 
 
-def test_an_apply_may_wait_as_its_rule_does():
+def test_check_accepts_apply_that_waits_like_its_rule():
     class Applied(Hesitates):
         pass
 
@@ -164,7 +164,7 @@ def test_an_apply_may_wait_as_its_rule_does():
     sound(Applied, {"action_space_mapping": None, "apply": apply})
 
 
-def test_an_apply_that_does_not_wait_as_its_rule_does_is_found():
+def test_check_finds_apply_that_does_not_wait_like_its_rule():
     class Applied(Hesitates):
         pass
 
@@ -267,7 +267,7 @@ def test_an_override_that_is_no_decision_point_is_an_error():
     assert "add it to points" in " ".join(seen.explanation.split())
 
 
-def test_overrides_that_are_points_or_call_super_are_sound():
+def test_check_accepts_overrides_that_are_points_or_call_super():
     clean(check_simulation(Herd, herd(Animal, Sheep), episodes=2))
     clean(check_simulation(SoundHerd, herd(Animal), episodes=2))
 
@@ -352,7 +352,7 @@ class Busy(Walk):
         return len(self.log) // 50
 
 
-def test_many_decisions_at_one_time_are_sound():
+def test_check_accepts_many_decisions_at_one_time():
     report = checked(Busy)
     assert report.ok, report
 
@@ -377,7 +377,7 @@ class Slow(Walk):
         return 1
 
 
-def test_a_check_ends_at_its_time_limit_and_tells_what_is_left():
+def test_check_ends_at_its_time_limit_and_lists_skipped_checks():
     begin = time.monotonic()
     report = checked(Slow, time_limit=2)
     assert time.monotonic() - begin < 5
@@ -405,12 +405,12 @@ fault_of("OneLabel", "error", "callable of labels",
          observation_labels=lambda walk: ["place"])  # fmt: skip
 
 
-def test_a_space_of_one_observation_is_sound():
+def test_check_accepts_a_space_of_one_observation():
     nothing = {"observation_space": spaces.Discrete(1), "observation_space_mapping": lambda walk: 0}
     sound(Walk, nothing)
 
 
-def test_labels_of_legal_actions_alone_are_sound():
+def test_check_accepts_labels_of_legal_actions_only():
     sound(Walk, {"action_labels": lambda walk: {0: "left"}})
 
 
@@ -427,7 +427,7 @@ class Tidy(Walk):
             os.chdir(folder)
 
 
-def test_the_grad_mode_around_a_decision_is_named(monkeypatch):
+def test_check_reports_a_torch_grad_mode_set_by_the_model(monkeypatch):
     modes = [True]
     torch = types.SimpleNamespace(is_grad_enabled=lambda: modes[-1])
     monkeypatch.setitem(sys.modules, "torch", torch)
@@ -474,7 +474,7 @@ class Broken(Walk):
 
 
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), WALKS)
-def test_faults_are_found_with_their_place(model, changes, options, severity, words, told):
+def test_check_reports_each_fault_with_its_place(model, changes, options, severity, words, told):
     report_with(model, changes, options, severity, words, told)
 
 

@@ -97,7 +97,7 @@ def clean(report):
     return report
 
 
-def test_a_sound_walk_is_clean():
+def test_check_of_a_sound_simulation_finds_nothing():
     report = clean(checked(Walk))
     assert report.findings == ()
     assert "nothing to complain of" in str(report)
@@ -106,7 +106,7 @@ def test_a_sound_walk_is_clean():
     assert any("Gymnasium's check_env (turn view)" in line for line in report.checked)
 
 
-def test_points_of_all_kinds_are_clean():
+def test_check_finds_nothing_in_sound_points_of_all_kinds():
     design = worlds.Design(worlds.KINDS, tuple((number % 9, number % 3) for number in range(27)))
     functions = worlds.points_of(design)
     report = clean(check_simulation(lambda: worlds.World(design, functions), functions, episodes=4))
@@ -127,14 +127,14 @@ COLONY = many_worlds.Design(initial=4, most=10, ticks=6, overseen="before")
     ],
     ids=["greenhouse", "colony", "meadow"],
 )
-def test_models_whose_agents_come_and_go_are_clean(simulation, points):
+def test_check_finds_nothing_if_agents_are_born_and_die(simulation, points):
     report = clean(check_simulation(simulation, points, episodes=2, max_steps=300, seeds=[5]))
     if simulation is GreenhouseSim:
         assert re.fullmatch(r"\(update_air_exchange choose_water_amount\)\{\d+\}", report.calls)
         assert [part.agents for part in report.statistics] == ["waterer_0", "ventilator_0"]
 
 
-def test_masks_of_several_components_are_clean():
+def test_check_finds_nothing_in_masks_of_several_components():
     changes = {
         "action_space": spaces.MultiDiscrete([3, 2]),
         "action_space_mapping": lambda action: int(action[0]) - 1,
@@ -152,7 +152,7 @@ def in_one_generator(seed):
     ("generators", "noted"),
     [(in_one_generator, ["1 for 3 agents, being_0 and being_1 among them"]), (Streams, [])],
 )
-def test_entities_that_share_generators_are_noted(generators, noted):
+def test_check_notes_entities_that_share_generators(generators, noted):
     def main(simulation):
         simulation.beings, simulation.generators = (
             list(map(many_worlds.Being, range(3))),
@@ -181,7 +181,7 @@ def seen_by(walk):
     return walk.observe()
 
 
-def test_a_given_fingerprint_alone_is_compared():
+def test_check_compares_only_the_given_fingerprint():
     clean(
         checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place)
     )
@@ -418,7 +418,7 @@ def test_faults_of_models_are_found(model, changes, options, severity, words, to
     assert report.of("error") == ((seen,) if severity == "error" else ()), str(report)
 
 
-def test_statistics_are_those_of_the_episodes():
+def test_statistics_describe_the_checked_episodes():
     space = spaces.Dict({"still": spaces.Box(0, 1, (2,), np.float32), "which": spaces.Discrete(30)})
     changes = {
         "observation_space": space,
@@ -495,7 +495,7 @@ def test_a_check_restores_generators_and_functions_in_silence(capsys):
     assert vars(Walk)["choose"] is before
 
 
-def test_options_and_points_reach_the_environments():
+def test_check_passes_options_and_points_to_its_environments():
     report = check_simulation(
         Walk, points(Walk) | points(Walk, "rest", agent="rester_0"), episodes=3
     )
@@ -577,7 +577,7 @@ def test_inspection_shows_where_a_model_fails():
         ),
     ],
 )
-def test_the_order_of_calls_is_shown_in_short(calls, told):
+def test_inspection_abbreviates_the_order_of_calls(calls, told):
     assert order_of(calls) == told
 
 
@@ -605,7 +605,7 @@ def holding(**attributes):
         ([Thing(1)], [Thing(1), Thing(1)]),
     ],
 )
-def test_differences_are_seen(one, other):
+def test_differences_finds_every_kind_of_change(one, other):
     assert differences(holding(it=one), holding(it=other))
 
 
@@ -624,13 +624,13 @@ def test_equal_models_have_no_differences(make):
     assert differences(holding(it=make()), holding(it=make())) == []
 
 
-def test_things_that_refer_to_themselves_are_written_down():
+def test_snapshot_handles_objects_that_refer_to_themselves():
     thing = Thing(1)
     thing.other = [thing]
     assert holding(it=thing)["simulation.it.other[0]"] == "the same object as simulation.it"
 
 
-def test_a_long_history_does_not_hide_the_rest():
+def test_snapshot_reaches_attributes_after_a_long_list():
     history = [[number] * 10 for number in range(10_000)]
     one, other = (holding(history=history, thing=random.Random(seed)) for seed in (1, 2))
     assert len(one) >= MOST_PARTS

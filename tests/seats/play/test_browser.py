@@ -280,7 +280,7 @@ def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, s
     assert server.end()[0] == 0
 
 
-def test_a_slow_model_is_told_at_once_and_no_click_counts_twice(open_page, start, tmp_path):
+def test_page_reports_a_slow_model_and_ignores_double_clicks(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
     server = start("--record", str(path), simulation="tests.seats.play.worlds:SlowShop")
     page = open_page(server, "buyer")
@@ -299,7 +299,7 @@ def test_a_slow_model_is_told_at_once_and_no_click_counts_twice(open_page, start
     assert server.end()[0] == 0
 
 
-def test_the_last_seconds_are_seen_and_a_wrong_key_sees_only_a_message(open_page, start):
+def test_page_shows_the_last_seconds_and_rejects_a_wrong_key(open_page, start):
     server = start("--limit", "11", "--tools", "facilitator", "--seat", "buyer")
     page = open_page(server, "buyer", **PHONE)
     page.wait_for_selector("#clock.late")

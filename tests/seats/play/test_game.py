@@ -146,7 +146,7 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ho
 
 
 @pytest.mark.parametrize("forks", [True, False])
-def test_the_way_back_and_forth_leads_to_the_same_decisions(make_host, forks, monkeypatch):
+def test_jump_undo_and_redo_lead_to_the_same_decisions(make_host, forks, monkeypatch):
     monkeypatch.setattr("simenv_marl.seats.play.game.CHECKPOINTS", 4)
     host = make_host()
     host.game.can_fork = forks
@@ -177,7 +177,7 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_host, forks, mo
     assert host.game.notice == ""
 
 
-def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_host):
+def test_seat_whose_agent_never_decides_is_reported_at_the_end(make_host):
     class Open(Shop):
         """Its agents are known when they decide."""
 
@@ -189,7 +189,7 @@ def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_host):
     assert host.game.notice == "No decision was one of buier; buyer decided."
 
 
-def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(make_host):
+def test_illegal_and_untimely_messages_get_a_reply_and_change_nothing(make_host):
     host = make_host(seats=())
     settle(host)
     wrong = [
@@ -271,7 +271,7 @@ def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_host):
     assert (think(host)["horizon"], think(host)["by_time"]) == (2, False)
 
 
-def test_a_decision_ends_the_thinking(make_host):
+def test_decision_ends_the_evaluation_of_futures(make_host):
     host = make_host()
     connection = Connection(
         (1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"})
@@ -286,7 +286,7 @@ def test_a_decision_ends_the_thinking(make_host):
     assert len(host.game.timeline) > 1
 
 
-def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_host):
+def test_rule_plays_for_delegated_seats_and_for_empty_ones(make_host):
     host = make_host(seats=())
     settle(host)
     host.handle("buyer", {"do": "delegate", "n": 2})
@@ -321,7 +321,7 @@ def test_after_the_limit_the_rule_decides_and_is_counted(make_host, monkeypatch)
     assert (host.game.timeline[0]["action"], host.game.timeline[0]["by"]) == (None, "limit")
 
 
-def test_errors_of_the_model_and_of_labels_end_the_episode_and_can_be_undone(make_host):
+def test_errors_of_model_and_labels_end_the_episode_and_can_be_undone(make_host):
     host = make_host(BreakingShop)
     assert "the till is broken" in play(host, [1, 3])["over"]
     host.handle("buyer", {"do": "undo"})
@@ -344,7 +344,7 @@ def test_pictures_are_sent_as_png(make_host):
     assert zlib.decompress(data[begin + 4 : begin + 4 + length]) == (b"\0" + b"\1" * 9) * 2
 
 
-def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_host, tmp_path):
+def test_recording_replays_exactly_and_omits_undone_decisions(make_host, tmp_path):
     host = make_host(seats=(), record=tmp_path / "game.jsonl")
     for _ in range(3):
         settle(host)
@@ -415,7 +415,7 @@ def test_a_recording_has_agents_that_end_before_others(make_host, tmp_path):
     }
 
 
-def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_host, tmp_path):
+def test_recording_that_cannot_be_written_is_reported_in_the_game(make_host, tmp_path):
     host = make_host(record=tmp_path / "game.jsonl")
     (tmp_path / "game.jsonl").unlink()
     (tmp_path / "game.jsonl").mkdir()
@@ -426,7 +426,7 @@ def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_ho
         make_host(record=tmp_path / "missing" / "game.jsonl")
 
 
-def test_past_decisions_keep_the_words_of_their_decision(make_host):
+def test_history_keeps_the_labels_of_each_past_decision(make_host):
     host = make_host(BreakingShop, unit="day")
     state = play(host, [2, 1])
     words = [(row["agent"], row["words"], row["when"]) for row in state["history"]]
@@ -439,7 +439,7 @@ def test_past_decisions_keep_the_words_of_their_decision(make_host):
     assert [row["words"] for row in settle(host)["history"]] == ["order 2 of 1", "order 1 of 1"]
 
 
-def test_values_labels_and_charts_are_those_of_one_decision(make_host):
+def test_situation_has_label_and_history_of_each_component(make_host):
     many = replace(
         ORDER,
         observation_space=spaces.Box(-np.inf, np.inf, (20,)),
@@ -457,7 +457,7 @@ def test_values_labels_and_charts_are_those_of_one_decision(make_host):
         assert entry["past"] == [place, place + 1, place + 2]
 
 
-def test_a_display_is_shown_in_place_of_the_observation(make_host):
+def test_game_page_shows_the_display_in_place_of_the_observation(make_host):
     shown = replace(
         ORDER, question="How much?", display_mapping=lambda shop: {"day": f"{shop.day} d"}
     )
@@ -550,7 +550,7 @@ def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
     assert time.monotonic() - begin < 2
 
 
-def test_a_restart_can_be_taken_back(make_host, tmp_path):
+def test_restart_of_a_game_can_be_undone(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     before = play(host, [1, 3])
@@ -564,7 +564,7 @@ def test_a_restart_can_be_taken_back(make_host, tmp_path):
     assert [len(each.decisions) for each in read(path)] == [6]
 
 
-def test_a_recording_is_resumed_where_it_stood(make_host, tmp_path):
+def test_recording_resumes_at_its_last_decision(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
     play(host, [1, 3, 2])
@@ -589,7 +589,7 @@ def test_a_recording_is_resumed_where_it_stood(make_host, tmp_path):
     assert len(read(path)) == 2
 
 
-def test_a_failed_write_is_made_up_for(make_host, tmp_path, monkeypatch):
+def test_recording_catches_up_after_a_failed_write(make_host, tmp_path, monkeypatch):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     path.rename(tmp_path / "kept")
@@ -627,7 +627,7 @@ def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
         assert (state["turn"], state["returns"]) == (turn, states[turn]["returns"])
 
 
-def test_a_policy_decides_in_its_seat_and_its_errors_are_told(make_host):
+def test_policy_of_a_seat_decides_and_its_errors_are_reported(make_host):
     async def policy(observation, *, _decision):
         assert not _decision.in_clone
         return [1, 2]
@@ -659,7 +659,7 @@ def test_joint_and_turn_policies_decide_in_seats(make_host):
     assert [row["action"] for row in history] == [1, [0, 1], 3, [0, 1]]
 
 
-def test_the_end_is_told_in_words_and_compared_with_the_rule(make_host):
+def test_game_describes_its_end_and_compares_it_with_the_rule(make_host):
     host = make_host(options={"max_steps": 6})
     state = play(host, [1, 3, 0])
     assert (state["over"], state["ending"]) == ("truncated", "Time is up.")
@@ -676,7 +676,7 @@ def test_the_end_is_told_in_words_and_compared_with_the_rule(make_host):
     assert settle(host)["turn"] == 0
 
 
-def test_only_who_has_the_tools_can_use_them(make_host):
+def test_undo_is_refused_to_seats_without_the_facilitators_tools(make_host):
     host = make_host(tools="facilitator")
     play(host, [1])
     with pytest.raises(InvalidActionError, match="facilitator"):
@@ -687,7 +687,7 @@ def test_only_who_has_the_tools_can_use_them(make_host):
         make_host(tools="nurse")
 
 
-def test_a_click_that_is_late_changes_nothing(make_host):
+def test_click_for_an_earlier_state_changes_nothing(make_host):
     host = make_host()
     state = play(host, [1, 2])
     for _ in range(2):
@@ -730,7 +730,7 @@ def test_numbers_that_json_lacks_never_leave_the_game(make_host):
         (spaces.Text(3), "four", "Enter at most 3 characters, not 'four'."),
     ],
 )
-def test_what_is_wrong_with_an_action_is_said_in_its_words(space, action, text):
+def test_complaint_about_an_action_uses_the_words_of_its_form(space, action, text):
     form = form_of(space, None, None)
     assert complaint_about(form, action)["text"] == text
     legal = jsonable(space.sample())
@@ -745,7 +745,7 @@ def test_masked_actions_are_hidden_and_values_have_four_digits():
     assert texts == ["0.3333", "1235", "123457", "1e-07", "12", "yes", "0.1"]
 
 
-def test_a_game_that_is_over_is_resumed_at_its_end(make_host, tmp_path):
+def test_recording_of_a_finished_game_resumes_at_its_end(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     over = play(make_host(record=path), [2] * 8)
     moments = {"moment": 0, "event": ""}

@@ -234,7 +234,7 @@ def test_another_host_is_refused(server, headers):
     caught.value.close()
 
 
-def test_a_page_of_another_site_is_refused_and_all_pages_are_served_here(server):
+def test_server_refuses_other_origins_and_serves_all_its_pages(server):
     with pytest.raises(InvalidStatus):
         server.page(additional_headers={"Origin": "http://evil.example"})
     for path in ("", "seat/buyer?key=x", "page.js", "page.css"):
@@ -323,14 +323,14 @@ def test_the_end_of_the_game_ends_the_server():
         (["tests.seats.play.worlds:LeavingShop"], "has ended, with exit code 3"),
     ],
 )
-def test_what_cannot_be_played_is_told(arguments, told, capsys):
+def test_play_command_reports_arguments_that_cannot_be_played(arguments, told, capsys):
     before = set(multiprocessing.active_children())  # joblib keeps its own for the next time
     assert main(["play", *arguments]) == 2
     assert told in capsys.readouterr().err
     assert set(multiprocessing.active_children()) <= before
 
 
-def test_the_function_takes_what_simulate_takes(monkeypatch, tmp_path):
+def test_play_function_takes_the_arguments_of_simulate(monkeypatch, tmp_path):
     made = []
 
     def serve(make, **options):
@@ -433,7 +433,7 @@ def test_a_number_that_is_too_large_never_returns_as_infinity(buyer):
     assert "1e999" in buyer.wait("error")["text"]
 
 
-def test_a_missing_extra_is_told(monkeypatch, capsys):
+def test_play_command_names_a_missing_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["play", SHOP]) == 2
     assert "play needs uvicorn: install simenv-marl[play]" in capsys.readouterr().err

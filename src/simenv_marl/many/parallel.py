@@ -356,7 +356,8 @@ class Worker(Peer):
         )
         with theirs:
             try:
-                self._process.start()
+                with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+                    self._process.start()  # from 3.12 on, Python warns of threads beside a fork
             except BaseException:
                 connection.close()
                 raise

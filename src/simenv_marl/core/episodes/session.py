@@ -47,7 +47,7 @@ from .base import (
 )
 from .episode import Episode
 from .events import Handlers, handlers_of
-from .state import EpisodeState, State, UnmatchedNames
+from .state import RUNNING, EpisodeState, State, UnmatchedNames
 
 MOST_SEEDS: Final = 100
 """How many seeds a reset tries until the one agent of a single view decides."""
@@ -63,8 +63,14 @@ class LimitedEpisode(Episode):
         if entered:
             super().step(action, entered)
             return
-        with self.driver.limit(self.plan.options.step_timeout or 0.0):
-            super().step(action)
+        try:
+            with self.driver.limit(self.plan.options.step_timeout or 0.0):
+                super().step(action)
+        except BaseException as error:
+            # The limit may end a step where no other error can arise.
+            if self.pending is None and self.outcome is RUNNING:
+                self.fail(error)
+            raise
 
 
 class Session(BaseSession):

@@ -676,6 +676,25 @@ def test_game_describes_its_end_and_compares_it_with_the_rule(make_host):
     assert settle(host)["turn"] == 0
 
 
+@pytest.mark.parametrize("finished", [False, True])
+def test_resumed_game_compares_with_the_rule_from_the_first_decision(make_host, tmp_path, finished):
+    path = tmp_path / "game.jsonl"
+    game = make_host(record=path).game
+    while not game.over and (finished or len(game.timeline) < 6):
+        is_person = game.plays(game.now["agent"])
+        game.decide(1 if is_person else None, "person" if is_person else "rule")
+    game.close()
+    host = make_host(record=path)
+    while not host.game.over:
+        host.game.decide(None, "rule")
+    compared = think(host)
+    plain = make_host()
+    while not plain.game.over:
+        plain.game.decide(None, "rule")
+    assert compared["note"] == ""
+    assert compared["totals"]["buyer"] == plain.game.returns["buyer"]
+
+
 def test_undo_is_refused_to_seats_without_the_facilitators_tools(make_host):
     host = make_host(tools="facilitator")
     play(host, [1])

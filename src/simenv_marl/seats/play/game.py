@@ -231,6 +231,8 @@ class Game:
                 raise InvalidActionError(
                     f"the simulation does not repeat decision {line['turn']} of {line['agent']}"
                 )
+            if self.plays(row["agent"]) and not self.checkpoints:
+                self.make_checkpoint()  # from which the rule's game begins
             self._take(answer_in(line), line["by"])
         if episode.turn != self.turn:
             self._go_to(episode.turn)

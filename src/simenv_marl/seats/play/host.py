@@ -359,7 +359,7 @@ class Host:
         yield self.snapshot()
         if self.exploring is None:
             return
-        if game.can_fork:
+        if game.checkpoints:  # else the clones are of this thread
             self.exploring.start(self._tell)
         else:
             yield from self.exploring.explore()

@@ -74,7 +74,7 @@ def test_templates_import_only_packages_that_the_command_names(kind):
         "simenv_marl",
         "numpy",
         "gymnasium",
-        *(package.replace("-", "_") for package in KINDS[kind].split()),
+        *re.findall(r"[\w-]+", KINDS[kind].partition("[")[0].replace("-", "_")),
     }
     tree = ast.parse((SOURCE / f"simenv_marl/testing/templates/{kind}.py").read_text())
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

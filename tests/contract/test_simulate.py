@@ -30,7 +30,7 @@ from tests.worlds.many_worlds import (
     designs,
     seeds,
 )
-from tests.worlds.models import calling, decision, script
+from tests.worlds.models import calling, decision, notes, script
 from tests.worlds.undone import fails
 
 
@@ -202,3 +202,11 @@ def test_a_policy_gets_the_simulation_of_its_own_episode(driver):
     done = simulate(Duel, {LEFT: policy}, points=points(), seed=1, driver=driver)
     assert asked
     assert all(simulation is done for simulation in asked)
+
+
+def test_note_of_an_error_counts_the_decisions_of_policies():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    policies = {"ant_0": lambda observation: 1, "bee_0": lambda observation: 2}
+    with pytest.raises(ZeroDivisionError) as caught:
+        simulate(calling(ant, bee, ant, lambda: 1 / 0), policies, points=[ant, bee], seed=1)
+    assert "after decision 3, of 'ant_0'" in notes(caught.value)

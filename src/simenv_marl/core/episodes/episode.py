@@ -631,9 +631,9 @@ class Episode(EpisodeState):
         if agent is None:
             where = "before the first decision"
         elif self._failed_in_model:
-            where = f"in the model, after decision {self.turns}, {agent.place}"
+            where = f"in the model, after decision {self.answered}, {agent.place}"
         else:
-            where = f"at decision {self.turns + 1}, {agent.place}"
+            where = f"at decision {self.answered + 1}, {agent.place}"
         annotate(error, f"simenv_marl: {where}; seed {self.seed}{hint}")
 
     def fail(self, error: BaseException) -> None:

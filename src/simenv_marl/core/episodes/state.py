@@ -306,6 +306,14 @@ class EpisodeState:
 
     # -- reports to views -------------------------------------------------------------------------
 
+    @property
+    def answered(self) -> int:
+        """The number of decisions that the user has answered; without one, that of all agents."""
+        if self.plan.has_user:
+            return self.turns
+        agents = (*self.agents.values(), *self.others.values(), *self.ended.values())
+        return sum(agent.answered for agent in agents)
+
     def take_ended(self) -> list[Agent]:
         """Return the ended agents that no view has reported yet, and forget them."""
         ended, self.just_ended = self.just_ended, []

@@ -14,7 +14,7 @@ from typing import Final
 
 from ...errors import OptionValueError, short_repr
 
-KINDS: Final = {"plain": "stable-baselines3", "simpy": "simpy", "mesa": "mesa"}
+KINDS: Final = {"plain": "stable-baselines3", "simpy": "simpy", "mesa": '"mesa[network]"'}
 """The packages that each kind of template needs besides ``simenv-marl[experiments]``."""
 
 _TESTS: Final = '''\

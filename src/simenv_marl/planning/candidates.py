@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
 from ..core import Policy
@@ -67,6 +67,15 @@ class Task:
     metric: Metric | None = None
     discount: float = 1.0
     discount_by: str = "decision"
+
+    def __repr__(self) -> str:
+        """Name the class, and the arguments that are not the defaults."""
+        given = [
+            f"{each.name}={short_repr(getattr(self, each.name))}"
+            for each in fields(self)
+            if getattr(self, each.name) is not each.default
+        ]
+        return f"{type(self).__name__}({', '.join(given)})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -228,6 +228,8 @@ def replay_episode(path: str | os.PathLike[str], until: int | None = None) -> st
     kind = f"{file.head['view']}, in a branch" if file.is_branch else view.kind
     head = f"{view.session.plan.name}, view {kind}, seed {view.session.seed}"
     timeline.append(f"now: {_shown(end_of(view.episode))}")
+    if file.failure:
+        timeline.append(file.failure)
     view.close()
     return "\n".join((head, *timeline))
 
@@ -251,6 +253,7 @@ class EpisodeFile:
     Attributes:
         head: The first line.
         answers: The answers.
+        failure: The user's answer that led to an error, which is left out, and the error.
     """
 
     def __init__(self, path: str | os.PathLike[str], until: int | None = None) -> None:
@@ -264,6 +267,7 @@ class EpisodeFile:
         episode = read_episodes(path)[-1]
         self.answers: list[Answered] = []
         self._last: Json = {}  # the line of the pending decision, of the end or of an error
+        self.failure = ""
         number = 1
         try:
             self.head = episode.head | {"reset": decode_value(episode.head.get("reset"))}
@@ -318,9 +322,11 @@ class EpisodeFile:
 
     def _cut(self) -> None:
         """Leave out the user's last answer, and whatever follows it."""
+        error = self._last.get("error", "the process has ended")
         self._last = {}
         places = [place for place, each in enumerate(self.answers) if each.is_by_user]
         for place in places[-1:]:
+            self.failure = f"then: {short_repr(self.answers[place].answer)}, and {error}"
             self._leave_out(place)
 
     def _stop_at(self, until: int) -> None:
@@ -329,6 +335,7 @@ class EpisodeFile:
         for place, each in enumerate(self.answers):
             if each.is_by_user and decisions >= until:
                 self._leave_out(place)
+                self.failure = ""
                 return
             decisions += "agent" in each.line
 

@@ -165,7 +165,11 @@ function legendOf(fan, shown, label, y, allSame) {
   const ends = y.low < y.high ? ` The charts go from ${show(y.low)} to ${show(y.high)}.` : "";
   const going = fan.done ? "" : ` Computing … ${of} of 16.`;
   const note = fan.note ? ` ${fan.note}` : "";
-  if (allSame !== null) return `${after}: ${show(allSame)}, whatever you answer.${going}${note}`;
+  if (allSame !== null) {
+    const low = show(Math.min(...shown.map(({ band }) => band[0].at(-1)))), high = show(Math.max(...shown.map(({ band }) => band[2].at(-1))));
+    const range = low === high ? "" : ` (8 of 10 futures: ${low} to ${high})`;
+    return `${after}: ${show(allSame)}${range}, whatever you answer.${going}${note}`;
+  }
   const middle = single ? "one future" : `the middle of ${of} futures; 8 of 10 lie in the band`;
   return `${after}: ${middle}.${ends}${going}${note}`;
 }

@@ -4,6 +4,7 @@ import pickle
 from functools import partial
 
 import pytest
+from examples.emergency.env import EmergencySimulation
 from examples.fin_base.env import PREMIUMS, TEAM, FundSim
 from examples.fin_base.pension import Parameters
 from examples.greenhouse_coop.env import VENTILATION, WATERING, GreenhouseSim
@@ -33,6 +34,7 @@ EXAMPLES = {
     "market": (Free, None),
     "market with a levy": (Levied, None),
     "queue": (QueueSimulation, None),
+    "emergency department": (EmergencySimulation, None),
     "sheep": (meadow, sheep_points(1)),
     "sheep that see further": (meadow, sheep_points(2)),
 }

@@ -1,0 +1,1 @@
+"""An emergency department in SimPy: interrupts, three kinds of decisions, and plans."""

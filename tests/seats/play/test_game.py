@@ -507,6 +507,8 @@ class Till:
     def take(self):
         return 0
 
+    points = (take,)
+
 
 @pytest.mark.parametrize(
     ("hold", "points"), [({}, 2), ({"hold": 2}, 4), ({"hold": 4}, 6), ({"hold": None}, 8)]

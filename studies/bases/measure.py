@@ -15,22 +15,10 @@ import numpy as np
 from examples.greenhouse_coop.env import VENTILATOR, WATERER, GreenhouseSim
 
 from simenv_marl import RULE, evaluate, simulate
-from simenv_marl.planning import RolloutPolicy
 
 from ..report import markdown
 from .model import MOST, PLACES, Queues
-
-
-class Planner(RolloutPolicy):
-    """A planner that keeps its latest choice, for the branches of others."""
-
-    latest: Any = RULE
-
-    def choose(self, env: Any) -> Any:
-        """Choose, and keep the choice."""
-        values = super().choose(env)
-        self.latest = values.best
-        return values
+from .planner import Planner
 
 
 def planner(begin: Any, follows: bool, **options: Any) -> Planner:

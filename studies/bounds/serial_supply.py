@@ -32,8 +32,8 @@ from examples.serial_supply.env import (
 from stockpyl.sim import simulation
 
 from simenv_marl import RULE, TRUNCATED, simulate
-from simenv_marl.planning import RolloutPolicy
 
+from ..bases.planner import Planner
 from .measured import cpu_seconds, draw, options_of, read, show, write
 
 FACTORS: Final = (0.9, 1.1, 1.25)
@@ -63,18 +63,6 @@ class Level:
     def __call__(self, observation: Any, *, _simulation: Chain) -> list[float]:
         """Return the quantity."""
         return [float(np.clip(self.level - _simulation.position(self.stage), 0.0, MOST))]
-
-
-class Planner(RolloutPolicy):
-    """A planner that keeps its latest choice, for the branches of others."""
-
-    latest: Any = RULE
-
-    def choose(self, env: Any) -> Any:
-        """Choose, and keep the choice."""
-        values = super().choose(env)
-        self.latest = values.best
-        return values
 
 
 def planner(stage: int, follow: bool, **options: Any) -> Planner:

@@ -64,7 +64,7 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_rule_in_every_view_equals_the_plain_run(view):
+def test_emergency_by_the_rule_equals_the_plain_run_in_every_view(view):
     make, run = VIEWS[view]
     world = make()
     run(world)
@@ -106,7 +106,7 @@ def test_interrupts_happen_on_usual_days():
     assert sum(one.interruptions for day in days for one in day.patients) >= 3
 
 
-def test_who_comes_and_what_they_need_does_not_depend_on_decisions():
+def test_arrivals_and_treatments_do_not_depend_on_decisions():
     def last(agent, info):
         return int(info["action_mask"].nonzero()[0][-1]) if "action_mask" in info else RULE
 
@@ -165,13 +165,13 @@ def test_a_bed_is_given_once_also_beside_answers_of_the_rule(first):
         assert world.unwrapped.simulation.waiting[0] not in world.unwrapped.simulation.assigned
 
 
-def test_the_rule_gets_what_other_answers_left():
+def test_rule_assigns_the_beds_that_other_answers_left():
     patients = [Patient(number, "cough", 0.0, LIGHT) for number in range(3)]
     given = assign(patients, ["plain", "plain", None], None, patients, ["monitored", "plain"])
     assert given == {patients[0]: "plain", patients[1]: "monitored"}
 
 
-def test_people_read_who_waits_and_what_is_asked():
+def test_questions_and_displays_describe_each_decision():
     texts = {}
 
     def note(observation, *, _decision):
@@ -204,13 +204,13 @@ def test_doctors_that_plan_are_not_worse_than_the_rule(capsys):
     assert row["difference_low"] <= 0  # costs
 
 
-def test_simulate_and_evaluate_tell_the_same():
+def test_simulate_and_evaluate_find_the_same_gain():
     seeds, options = [1], {"futures": 2, "horizon": 45.0}
     found = plan.compare(seeds, **options).summary(metric="cost")
     assert plan.gains(seeds, **options) == [pytest.approx(-found["difference"]["doctors plan"])]
 
 
-def test_a_planner_does_not_foresee_treatments_of_those_who_wait():
+def test_planner_does_not_foresee_treatments_of_waiting_patients():
     def work(seed):
         simulation = EmergencySimulation()
         simulation.reset(seed=1)

@@ -22,6 +22,8 @@ import java.util.Map;
 import java.util.Objects;
 import java.util.Set;
 import java.util.SplittableRandom;
+import java.util.concurrent.ForkJoinPool;
+import java.util.concurrent.TimeUnit;
 import java.util.concurrent.atomic.AtomicInteger;
 import java.util.concurrent.atomic.AtomicLong;
 import java.util.function.BooleanSupplier;
@@ -52,7 +54,8 @@ import java.util.function.Supplier;
  * the standard streams. Without that variable, the rule makes every decision; the overhead is one test, and the
  * arguments are not collected.
  *
- * <p>Any thread of the model may ask for decisions, one at a time. Such threads have to end with their episode.
+ * <p>Any thread of the model may ask for decisions, one at a time. Such threads have to end with their episode, also where
+ * it is stopped; those of the common pool (parallel streams) are waited for then.
  */
 public final class SimEnv {
     private static final int VERSION = 1;
@@ -220,6 +223,8 @@ public final class SimEnv {
             result = episode.run(seeded, options(start.get("options")));
         } catch (Throwable thrown) {
             error = thrown;
+            // a parallel stream that fails in one thread does not wait for its others, which would ask in the next episode
+            ForkJoinPool.commonPool().awaitQuiescence(SECONDS_TO_LEAVE, TimeUnit.SECONDS);
         }
         finish(result, error);
     }

@@ -57,6 +57,7 @@ public final class Probe {
             case "huge" -> guarded(() -> any(a -> a.put("value", "x".repeat(16 << 20))));
             case "truncated" -> new SimEnv.End(Map.of("reached", 3), true);
             case "threads" -> threads();
+            case "late_threads" -> IntStream.range(0, 2).parallel().map(Probe::late).sum();
             case "leave" -> {
                 System.exit(((Number) options.get("status")).intValue());
                 yield null;
@@ -153,6 +154,15 @@ public final class Probe {
 
     static Object threads() {
         return IntStream.range(0, 4).parallel().map(Probe::sum).boxed().toList();
+    }
+
+    static int late(int n) {
+        try {
+            Thread.sleep(Thread.currentThread().getName().equals("main") ? 0 : 200);
+        } catch (InterruptedException error) {
+            throw new IllegalStateException(error);
+        }
+        return sum(n);
     }
 
     static int sum(int n) {

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import subprocess
+import time
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -317,6 +318,20 @@ def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
     child.begin(play="threads")
     child.send(stop=True)
     assert plays_well(child)
+
+
+def slowly(call):
+    """Takes longer than a thread of the stopped episode sleeps."""
+    time.sleep(0.005)
+    return call["args"]["n"]
+
+
+@JAVA
+def test_a_thread_of_a_stopped_episode_does_not_decide_in_the_next(child):
+    child.begin(play="late_threads")
+    child.send(stop=True)
+    calls, _ = child.play(slowly, play="late_threads")
+    assert len(calls) == 100
 
 
 SEEDS = {"C++": (0, 2**64 - 1), "Java": (-(2**63), 2**63 - 1), "Python": (0, 2**31 - 1)}

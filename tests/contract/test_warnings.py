@@ -399,7 +399,8 @@ def test_functions_that_end_agents_are_named_as_points_are(key, form, heard):
 
 
 def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard):
-    env = begun(aec_env(PAIR, beings()))
+    play_in_turns(aec_env(PAIR, beings()), 1)  # nobody can have been removed
+    env = begun(aec_env(life("1 acts, 0 acts, 0 acts, 0 acts"), beings()))
     env.close()
     assert not heard("removed_by= of")
     play_in_turns(env, 1)

@@ -485,7 +485,7 @@ class Check(Runner):
                     reason = describe_error(run.error)
                 # The tests ignore masks, changes of masks, and the bounds of some spaces.
                 elif isinstance(run.error, InvalidActionError):
-                    reason = f"of an illegal action: {error_text(run.error)}"
+                    reason = f"it takes illegal actions: {error_text(run.error)}"
                 elif isinstance(run.error, AssertionError):
                     self.add("failed_test", describe_with_place(run.error), test=name)
                 else:

@@ -143,15 +143,17 @@ class UnmatchedNames:
             if not hooks or point.hook in self._points:
                 continue
             agents = [*episode.agents.values(), *episode.others.values(), *episode.ended.values()]
-            if not any(agent.answered and agent.point.hook is point.hook for agent in agents):
-                continue
+            counts = [agent.answered for agent in agents if agent.point.hook is point.hook]
+            if not counts or max(counts) < min(counts) + 2:
+                continue  # as if nobody were removed: all have decided equally often
             self._points.add(point.hook)
             if hooks.isdisjoint(called):
                 names = sorted(hook.name for hook in hooks)
                 warn_user(
                     f"removed_by= of {point.hook.name} names {listed(names)}, which the model did"
-                    " not call in an episode in which its agents decided. If agents were removed,"
-                    " name the function that the model calls"
+                    f" not call in an episode in which agents decided {min(counts)} to"
+                    f" {max(counts)} times. If agents were removed, name the function that the"
+                    " model calls"
                 )
 
 

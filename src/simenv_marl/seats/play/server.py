@@ -384,7 +384,7 @@ def serve(
             shown_host = socket.gethostname()
         base = f"http://{shown_host}:{bound}"
         if state["resumed"]:
-            print(f"The game of {record} goes on.", flush=True)
+            print(f"The game of {record} goes on, with seed {state['seed']}.", flush=True)
         print(f"Take a seat or watch at {base}/ or play at the link of a seat:", flush=True)
 
         def announce(path: str) -> None:

@@ -13,7 +13,7 @@ from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, costs
 from tests.worlds.saved import Pumps
 
 SAID = re.compile(
-    r"simenv_marl: (\d+) candidates x (\d+) futures x ([\d.]+ m?s) on \d+ cores: about"
+    r"simenv_marl: (\d+) candidates x (\d+) futures x ([\d.]+ m?s) on \d+ cores?: about"
     r" ([\d.]+ m?s) a decision, ([\d.]+ m?s) an episode"
 )
 
@@ -103,6 +103,16 @@ def test_short_runs_and_single_simulations_report_no_cost(monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.0)
     simulate(Slow, POLICIES, seed=1)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("method", "seconds"), [("fork", "3 s"), ("replay", "8 s")])
+def test_reported_cost_of_a_replay_includes_half_of_the_past(method, seconds, monkeypatch, capfd):
+    monkeypatch.setattr(costs, "LONG", 0.0)
+    future = costs.Future(decisions=10, seconds=10.0, time=10.0, is_over=True)
+    monkeypatch.setattr(costs, "_time_future", lambda env, number, base: future)
+    planner = RolloutPolicy([[0, 1], [1, 0]], futures=2, horizon=3, every=4, method=method)
+    simulate_many(Slow, {"push": planner}, seeds=[1, 2])
+    assert f"3 candidates x 1 futures x {seconds} on " in capfd.readouterr().err
 
 
 def test_measuring_the_cost_of_a_decision_does_not_change_results(monkeypatch, capfd):

@@ -57,14 +57,17 @@ def say_costs(
         share = min(1.0, task.horizon / length) if length else 1.0
     can_fork = method != "replay" and player.view.driver == "greenlet"
     cores = len(os.sched_getaffinity(0)) if can_fork else 1
-    decision = branches * share * future.seconds / max(1, cores // load.processes)
+    seconds = share * future.seconds
+    if not can_fork:
+        seconds += future.seconds / 2  # a replay repeats the past: half an episode on average
+    decision = branches * seconds / max(1, cores // load.processes)
     episode = decision * future.decisions / task.every
     if episode * load.episodes / load.processes < LONG:
         return
     futures = f"{candidates} candidates x {branches / candidates:.3g} futures"
     at_least = "" if future.is_over else "more than "
     print(
-        f"simenv_marl: {futures} x {_shown(share * future.seconds)} on {cores} cores: about"
+        f"simenv_marl: {futures} x {_shown(seconds)} on {cores} core{'s' * (cores > 1)}: about"
         f" {_shown(decision)} a decision, {at_least}{_shown(episode)} an episode",
         file=sys.stderr,
         flush=True,

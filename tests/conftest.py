@@ -6,20 +6,11 @@ import random
 import signal
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 from simenv_marl.core.plans.options import Options
 from simenv_marl.core.switching import opened
-
-# Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
-settings.register_profile(
-    "tests",
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-settings.load_profile("tests")
+from tests import extent
 
 # A shell that starts the tests in the background has them ignore interrupts, which some are about.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -36,6 +27,12 @@ def pytest_addoption(parser):
         help="drivers to test the contract with",
     )
     parser.addoption(
+        "--extent",
+        choices=("quick", "thorough", "all"),
+        default="all",
+        help="quick: few random examples, no tests that are marked thorough; thorough: the rest",
+    )
+    parser.addoption(
         "--order",
         metavar="SEED",
         help="shuffle files and tests by this seed, or by a new one: random",
@@ -46,6 +43,19 @@ def pytest_configure(config):
     config.addinivalue_line(
         "markers", "greenlet(reason): what is tested is different with other drivers"
     )
+    config.addinivalue_line("markers", "thorough: takes long, so `make test` leaves it out")
+    if config.option.extent == "quick":
+        extent.share = extent.QUICK
+    # Hypothesis draws the same examples at every run, keeps no files, and ignores the clock.
+    settings.register_profile(
+        "tests",
+        extent.examples(100),
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    settings.load_profile("tests")
     if config.option.order == "random":
         # The processes of pytest-xdist are to have the same one.
         config.option.order = os.environ.setdefault(
@@ -62,6 +72,17 @@ def pytest_report_header(config):
 
 
 def pytest_collection_modifyitems(config, items):
+    if config.option.extent != "all":
+        parts = {"quick": [], "thorough": []}
+        for item in items:
+            is_property = is_hypothesis_test(getattr(item, "obj", None))
+            if is_property or item.get_closest_marker("thorough"):
+                parts["thorough"].append(item)
+            if not item.get_closest_marker("thorough"):
+                parts["quick"].append(item)
+        kept = parts[config.option.extent]
+        config.hook.pytest_deselected(items=[item for item in items if item not in set(kept)])
+        items[:] = kept
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
         places = {

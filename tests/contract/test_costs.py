@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import (
@@ -17,6 +17,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.errors import DefinitionError, RewardError
+from tests.extent import examples
 from tests.worlds import random_worlds as yards
 from tests.worlds.models import calling, decision, define, play, script
 
@@ -66,7 +67,7 @@ def pairs(make, yard, points, options, seed):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-@settings(max_examples=25)
+@examples(25)
 @given(design=yards.designs, seed=yards.seeds, skip=st.booleans(), masked=st.booleans())
 def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
     options = {"skip_forced": skip}

@@ -4,11 +4,12 @@ import gc
 
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
+from tests.extent import examples
 from tests.worlds.marks import VIEWS
 from tests.worlds.models import follow_the_rule
 from tests.worlds.random_worlds import (
@@ -54,7 +55,7 @@ def made(view, design, **options):
 
 
 @given(designs, seeds, OPTIONS)
-@settings(max_examples=150)
+@examples(150)
 def test_every_view_stepped_with_rule_matches_the_plain_run(design, seed, options):
     expected = outcome(plain(design, seed))
     for view in VIEWS:
@@ -157,7 +158,7 @@ uses = st.lists(
 
 
 @given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
-@settings(max_examples=120)
+@examples(120)
 def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:

@@ -4,7 +4,7 @@ import re
 from weakref import ref
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from simenv_marl import (
     RULE,
@@ -25,6 +25,7 @@ from simenv_marl.errors import (
     UnknownAgentError,
     UnknownPointError,
 )
+from tests.extent import examples
 from tests.worlds import lives
 from tests.worlds.lives import life, story
 from tests.worlds.many_worlds import (
@@ -571,7 +572,7 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 
 @given(designs, seeds)
-@settings(max_examples=120)
+@examples(120)
 def test_random_colony_in_the_aec_view_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     if not plain.decisions:

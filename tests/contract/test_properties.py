@@ -1,10 +1,11 @@
 """Random simulations, compared with what was computed without the library."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from simenv_marl import RULE, aec_env
 from simenv_marl.errors import EpisodeOverError
+from tests.extent import examples
 from tests.worlds.models import play
 from tests.worlds.worlds import (
     Reference,
@@ -57,7 +58,7 @@ def agrees(env, reference):
 
 
 @given(designs(), seeds, answers)
-@settings(max_examples=300)
+@examples(300)
 def test_random_episodes_match_a_reference_implementation(design, seed, given_answers):
     """Also the rewards that each step books: none is lost or counted twice."""
     env = made(design)

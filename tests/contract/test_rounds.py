@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, branch, joint_env, parallel_env
@@ -18,6 +18,7 @@ from simenv_marl.errors import (
     NotResetError,
     UnknownAgentError,
 )
+from tests.extent import examples
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import (
     Announcing,
@@ -363,7 +364,7 @@ class Rounds:
     max_steps=st.none() | st.integers(1, 6),
     data=st.data(),
 )
-@settings(max_examples=150)
+@examples(150)
 @pytest.mark.filterwarnings("ignore:.*agents that did not appear")
 def test_random_rounds_match_a_reference_implementation(program, seed, max_steps, data):
     env = parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
@@ -448,7 +449,7 @@ def played(env, seed, in_turns):
 
 
 @given(designs, seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from simenv_marl import RULE, aec_env, simulate, simulate_many
 from simenv_marl.errors import (
@@ -17,6 +17,7 @@ from simenv_marl.errors import (
     UnknownPointError,
 )
 from tests.conftest import DRIVERS
+from tests.extent import examples
 from tests.worlds.duels import LEFT, Duel, points
 from tests.worlds.many_worlds import (
     HERE,
@@ -94,7 +95,7 @@ def test_simulate_refuses_invalid_arguments(run, arguments, error, match):
 
 
 @given(designs, seeds)
-@settings(max_examples=40)
+@examples(40)
 def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
     plain = Answered(design, seed)
     points = colony_points(overseen=bool(design.overseen))

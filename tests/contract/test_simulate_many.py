@@ -9,13 +9,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, evaluate, simulate, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import InvalidActionError, MissingExtraError, OptionValueError
 from simenv_marl.experiments import run_experiment
+from tests.extent import examples
 from tests.worlds import worlds
 from tests.worlds.counters import same
 from tests.worlds.models import calling, decision, define, notes, plainly, script, stacks
@@ -61,7 +62,7 @@ going = {Going.decide: define(agent="going_0")}
 
 
 @given(worlds.designs(), some_seeds, sizes)
-@settings(max_examples=60)
+@examples(60)
 def test_simulate_many_matches_simulate_one_by_one(design, seeds, size):
     """All kinds of decision points: nested, generators, with choices, of entities, named late."""
 

@@ -1,7 +1,7 @@
 """One reward for the team, in all views."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from simenv_marl import (
     RULE,
@@ -15,6 +15,7 @@ from simenv_marl import (
     turn_env,
 )
 from simenv_marl.errors import OptionValueError, RewardError
+from tests.extent import examples
 from tests.worlds import random_worlds as yards
 from tests.worlds.models import calling, decision, define, play, script
 
@@ -114,7 +115,7 @@ def earned(yard):
 
 
 @given(yards.designs, yards.seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
     options = {
         "possible_agents": yards.ROSTER,
@@ -154,7 +155,7 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
 
 
 @given(yards.designs, yards.seeds)
-@settings(max_examples=30)
+@examples(30)
 def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, seed):
     env = parallel_env(
         lambda: yards.Yard(design),

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
+from hypothesis import given
 
 from simenv_marl import RULE, aec_env, clone, generate_env, turn_env, vector_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError, UnknownOptionError, ViewError
+from tests.extent import examples
 from tests.worlds import random_worlds as yards
 from tests.worlds import worlds
 from tests.worlds.models import Timed, calling, decision, script
@@ -68,7 +69,7 @@ def compared(aec, turn, seed, action_of):
 
 
 @given(yards.designs, yards.seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
     options = {"possible_agents": yards.ROSTER}
     compared(
@@ -80,7 +81,7 @@ def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
 
 
 @given(worlds.designs(), worlds.seeds, worlds.answers)
-@settings(max_examples=100)
+@examples(100)
 def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
     points = worlds.points_of(design)
     policies = {points[point]: worlds.advised for point in design.policies} | {

@@ -5,7 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, aec_env
@@ -13,6 +13,7 @@ from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row, ones
+from tests.extent import examples
 from tests.worlds import worlds
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import (
@@ -101,7 +102,7 @@ def check(found, episodes, chosen):
 
 
 @given(designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
-@settings(max_examples=60)
+@examples(60)
 def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
     def policy(observation, info):
         number = int(observation.sum()) % 6
@@ -126,7 +127,7 @@ def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, 
 
 
 @given(worlds.designs(), some_seeds, sizes)
-@settings(max_examples=80)
+@examples(80)
 def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
     def simulation():
         return worlds.World(design, points)

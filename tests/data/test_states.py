@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import (
@@ -30,6 +30,7 @@ from simenv_marl.data import (
 )
 from simenv_marl.errors import AgentError, NoDecisionError, ObservationError, OptionValueError
 from simenv_marl.plugins import attach_handler, remove_handler
+from tests.extent import examples
 from tests.worlds.models import calling, decision, play
 from tests.worlds.random_worlds import (
     HERE,
@@ -78,7 +79,7 @@ def checking_one(observation, info, *, _state):
 
 
 @given(designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
-@settings(max_examples=40)
+@examples(40)
 def test_trajectories_have_the_states_at_decisions_and_ends(design, several, size, most):
     found = collect_episodes(
         lambda: Yard(design),
@@ -103,7 +104,7 @@ def test_trajectories_have_the_states_at_decisions_and_ends(design, several, siz
 
 
 @given(designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
-@settings(max_examples=20)
+@examples(20)
 def test_states_of_observations_match_an_aec_environment(design, several, whose):
     options = {
         "points": POINTS,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, joint_env, single_env, vector_env
@@ -28,6 +28,7 @@ from simenv_marl.errors import (
     ViewError,
     WrongThreadError,
 )
+from tests.extent import examples
 from tests.worlds.counters import (
     FORK,
     FORKS,
@@ -81,7 +82,7 @@ def test_matches_sync_vector_env(kind, mode, processes):
 @given(
     designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.sampled_from([*[0] * 9, 1, 3])
 )
-@settings(max_examples=150)
+@examples(150)
 def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number, processes):
     ours = made(design, number, mode, workers=processes, context=FORK)
     if ours is None:

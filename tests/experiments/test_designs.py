@@ -7,11 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pydoe
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl.errors import MissingExtraError, OptionValueError
 from simenv_marl.experiments import design
+from tests.extent import examples
 
 SIZED = ("latin_hypercube", "sobol", "halton")
 TWO_LEVELS = ("fractional_factorial", "plackett_burman")
@@ -47,7 +48,7 @@ def values(table, name):
     return table[name].tolist()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     factors=factors,
     method=st.sampled_from(METHODS),

@@ -9,7 +9,7 @@ import pytest
 from examples.greenhouse_coop.env import WATERER, GreenhouseSim
 from examples.queue_admission.env import AGENT, QueueSimulation
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, evaluate, joint_env, make_step, simulate, turn_env
@@ -18,6 +18,7 @@ from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError
 from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
 from simenv_marl.planning import RolloutPolicy
 from simenv_marl.seats import describe
+from tests.extent import examples
 from tests.worlds.fairs import POINTS, POLICIES, Fair, advised, boldest
 from tests.worlds.models import Script, define
 
@@ -79,7 +80,7 @@ def returns_of(simulation, points, policies, seed, **options):
     forced=st.booleans(),
     steps=st.none() | st.integers(1, 12),
 )
-@settings(max_examples=WORLDS)
+@examples(WORLDS)
 def test_contributions_add_up_to_the_difference(seed, driver, method, forced, steps):
     options = {"points": POINTS, "skip_forced": forced, "max_steps": steps, "driver": driver}
     found = ledger(Fair, POLICIES, seeds=[seed], method=method, **options)
@@ -241,7 +242,7 @@ def test_ledger_separates_skill_from_luck():
 
 
 @given(seed=seeds)
-@settings(max_examples=4)
+@examples(4)
 def test_value_skill_and_luck_add_up_to_the_return(seed):
     found = ledger(Fair, POLICIES, seeds=[seed], points=POINTS, futures=3)
     if len(found.frame):

@@ -1,0 +1,13 @@
+"""How many random examples a test tries: few in `make test`, all in `make test-thorough`."""
+
+from hypothesis import settings
+
+QUICK = 0.1
+"""The share of the examples that `--extent quick` leaves."""
+
+share = 1.0
+
+
+def examples(number):
+    """Settings of a property test that tries so many examples, or their share."""
+    return settings(max_examples=max(2, round(share * number)))

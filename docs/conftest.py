@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.worlds.undone import models_of_pages_forgotten, registries_put_back
+from tests.worlds.models import models_of_pages_forgotten, registries_put_back
 
 # A model that is only found from a page, one that is a process, and five that need other packages.
 collect_ignore = [

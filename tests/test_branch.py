@@ -45,10 +45,9 @@ from simenv_marl.errors import (
 )
 from tests.core.test_global_rng import world
 from tests.processes import gone, python, run_code
-from tests.worlds import exactness, filing
-from tests.worlds.models import begun, define
-from tests.worlds.trips import POINTS, Lucky, Trip, future, move, trip
-from tests.worlds.undone import fails
+from tests.worlds.copied import POINTS, Lucky, Trip, future, move, trip
+from tests.worlds.models import begun, define, fails
+from tests.worlds.saved import choose, differing_branches, rest_of_archive
 
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
 
@@ -319,9 +318,9 @@ def test_actions_are_replayed_as_they_were_given():
 def test_branches_and_clones_of_random_worlds_are_exact():
     """Also of files and of global generators.
 
-    For a larger number: ``python -m tests.worlds.exactness 10000``.
+    For a larger number: ``python -m tests.worlds.saved 10000 branches``.
     """
-    differ, number = exactness.differing(300)
+    differ, number = differing_branches(300)
     assert (differ, number >= 300) == (0, True)
 
 
@@ -336,7 +335,7 @@ class Holding:
         opened = self.open()
         with opened:
             for _ in range(6):
-                self.log.append((filing.choose(), self.chance.random()))
+                self.log.append((choose(), self.chance.random()))
 
 
 @contextmanager
@@ -406,7 +405,7 @@ def a_progress_bar(model):
 
 def held_by(model):
     """An environment of a model that decides while it holds something."""
-    return begun(single_env(model, filing.choose), 4)
+    return begun(single_env(model, choose), 4)
 
 
 @pytest.mark.parametrize(
@@ -427,11 +426,11 @@ def test_resource_that_prevents_a_fork_is_named_or_replay_is_used(held, name):
     for copied in (partial(branch, env, never), partial(clone, env)):
         with pytest.raises(BranchError, match=f"{name}.*replay"):
             copied(method="fork")
-    found, twin = branch(env, filing.left, 2), clone(env)
+    found, twin = branch(env, rest_of_archive, 2), clone(env)
     deeper = clone(twin)
     assert deeper.call(lambda env: os.getpid()) == os.getpid()
     for each in (deeper, twin, env):  # to its end, or its thread stays
-        found.append(filing.left(each))
+        found.append(rest_of_archive(each))
     assert found == [found[0]] * 5
 
 
@@ -439,7 +438,7 @@ def test_a_model_that_shows_a_progress_bar_is_forked(monkeypatch):
     tqdm = pytest.importorskip("tqdm").tqdm
     monkeypatch.setattr(tqdm, "monitor", None)  # so that this model starts it
     env = held_by(type("Model", (Holding,), {"open": a_progress_bar}))
-    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
+    assert branch(env, rest_of_archive, 1, method="fork") == [rest_of_archive(env)]
     tqdm.monitor.exit()
 
 
@@ -447,7 +446,7 @@ def test_a_model_that_shows_a_progress_bar_is_forked(monkeypatch):
 def test_memory_that_no_process_can_change_is_forked(held):
     env = held_by(type("Model", (Holding,), {"open": held}))
     with anonymous_memory(None):  # which the simulation does not hold
-        assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
+        assert branch(env, rest_of_archive, 1, method="fork") == [rest_of_archive(env)]
 
 
 def test_memory_that_was_shared_before_the_import_does_not_count():
@@ -455,7 +454,7 @@ def test_memory_that_was_shared_before_the_import_does_not_count():
 import mmap
 memory = mmap.mmap(-1, 100)
 from simenv_marl import branch
-from tests.worlds.trips import trip
+from tests.worlds.copied import trip
 env = trip()
 print(branch(env, lambda env, number: number, 1, method="fork"))
 """
@@ -479,7 +478,7 @@ class Listening(Holding):
             loop.add_reader(
                 reading, lambda heard=heard: heard.done() or heard.set_result(os.read(reading, 1))
             )
-            filing.choose()
+            choose()
             os.write(writing, bytes([number]))
             self.log.append(await asyncio.wait_for(heard, 10))
         loop.remove_reader(reading)
@@ -491,7 +490,9 @@ def test_asyncio_event_loops_continue_in_a_fork(monkeypatch):
     env = held_by(Listening)
     env.step(1)
     assert (
-        branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
+        branch(env, rest_of_archive, 1, method="fork")
+        == [rest_of_archive(env)]
+        == [[b"\0", b"\1", b"\2"]]
     )
     monkeypatch.delitem(sys.modules, "asyncio.selector_events")  # as where asyncio is not imported
     assert event_loops() == []
@@ -506,7 +507,7 @@ class Polling(Holding):
         with select.epoll() as poll:
             poll.register(reading, select.EPOLLIN | select.EPOLLONESHOT)
             for _ in range(2):
-                filing.choose()
+                choose()
                 self.log.append(len(poll.poll(0)))
         os.close(reading)
         os.close(writing)
@@ -516,16 +517,16 @@ class Polling(Holding):
 def test_simulations_with_an_epoll_object_are_replayed():
     env = held_by(Polling)
     with pytest.raises(BranchError, match=r"an epoll object \(descriptor \d+\).*replay"):
-        branch(env, filing.left, 2, method="fork")
-    assert branch(env, filing.left, 2) == [[1, 0]] * 2
-    assert filing.left(env) == [1, 0]
+        branch(env, rest_of_archive, 2, method="fork")
+    assert branch(env, rest_of_archive, 2) == [[1, 0]] * 2
+    assert rest_of_archive(env) == [1, 0]
 
 
 @pytest.mark.parametrize("flush", [False, True])
 def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
     code = f"""
         from simenv_marl import branch, clone
-        from tests.worlds.trips import trip
+        from tests.worlds.copied import trip
 
         env = trip()
         print("before", flush={flush})

@@ -36,11 +36,10 @@ from simenv_marl.errors import (
 from tests.core.test_global_rng import world
 from tests.processes import ROOT, alone, descriptors, gone, runs
 from tests.test_branch import METHODS, ahead, children
-from tests.worlds.counters import FORK, FORKS, POINT, Counter
-from tests.worlds.duels import Duel, points
-from tests.worlds.models import begun, notes
-from tests.worlds.trips import POINTS, VIEWS, Free, Lucky, Trip, future, move, outcome, trip
-from tests.worlds.undone import fails
+from tests.worlds.copied import POINTS, VIEWS, Free, Lucky, Trip, future, move, outcome, trip
+from tests.worlds.models import begun, fails, notes
+from tests.worlds.valued import Duel, points
+from tests.worlds.vectors import FORK, FORKS, POINT, Counter
 
 LUCKY = {"simulation": Lucky, "global_rng": True}
 OPTIONS = {
@@ -289,7 +288,7 @@ USER = """
 import os, sys, threading, time
 from tqdm import tqdm
 from simenv_marl import clone
-from tests.worlds.trips import trip
+from tests.worlds.copied import trip
 def number(env):
     return os.getpid()
 def keep(env):
@@ -750,7 +749,7 @@ def make_slowly():
             return 1
 
     Slow.begun.clear()
-    single_env(Model, {Model.walk: POINTS["tests.worlds.trips.Trip.walk"]}).close()
+    single_env(Model, {Model.walk: POINTS["tests.worlds.copied.Trip.walk"]}).close()
 
 
 def by_hand(env):

@@ -28,7 +28,7 @@ def shaken(walk):
 
 
 class Limping(Walk):
-    points = {copied.Walk.choose: copied.define(observation_space_mapping=shaken)}
+    points = {copied.Walk.choose: copied.define_walk(observation_space_mapping=shaken)}
 
 
 number = 3

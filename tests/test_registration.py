@@ -19,11 +19,10 @@ from simenv_marl.errors import (
 )
 from simenv_marl.experiments import Variant
 from tests.processes import python
-from tests.worlds import many_registered
-from tests.worlds.many_registered import Boat, Voyage
-from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import begun, calling, decision, define, play
-from tests.worlds.undone import registries_put_back
+from tests.worlds import copied
+from tests.worlds.copied import Boat, Voyage
+from tests.worlds.entities import Being, beings
+from tests.worlds.models import begun, calling, decision, define, play, registries_put_back
 
 SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
 JOINT, TURN = "manyregistered/Joint-v0", "manyregistered/Turn-v0"
@@ -43,8 +42,8 @@ def made(identity, **options):
 
 
 def test_registration_gives_ids_for_points_and_multi_agent_views():
-    assert [*SINGLES, JOINT, TURN, COOP] == many_registered.IDS
-    assert set(many_registered.IDS[:-1]) <= set(gymnasium.registry)
+    assert [*SINGLES, JOINT, TURN, COOP] == copied.IDS
+    assert set(copied.IDS[:-1]) <= set(gymnasium.registry)
     for kind, base in (("aec", pettingzoo.AECEnv), ("parallel", pettingzoo.ParallelEnv)):
         spec = pettingzoo.spec(kind, COOP)
         assert isinstance(spec.entry_point, str)
@@ -251,7 +250,7 @@ def test_a_refused_registration_leaves_the_registries_unchanged(register, change
 
 def test_registered_ids_and_specs_work_in_another_process():
     """In vectors too: spawned processes, the default outside Linux, know only the spec."""
-    env = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}", max_steps=2)
+    env = gymnasium.make(f"tests.worlds.copied:{SINGLES[0]}", max_steps=2)
     code = f"""
 import gymnasium, pettingzoo
 from gymnasium.envs.registration import EnvSpec
@@ -259,10 +258,10 @@ if __name__ == "__main__":
     env = gymnasium.make(EnvSpec.from_json({env.spec.to_json()!r}))
     print(env.reset(seed=5)[0].tolist())
     print([env.step([0.5])[3] for _ in range(2)])
-    print(gymnasium.make("tests.worlds.many_registered:{JOINT}").spec.id)
+    print(gymnasium.make("tests.worlds.copied:{JOINT}").spec.id)
     print(*[pettingzoo.make(kind, {COOP!r}).possible_agents for kind in ("aec", "parallel")])
     spawned = {{"vectorization_mode": "async", "vector_kwargs": {{"context": "spawn"}}}}
-    envs = gymnasium.make_vec("tests.worlds.many_registered:{SINGLES[0]}", num_envs=2, **spawned)
+    envs = gymnasium.make_vec("tests.worlds.copied:{SINGLES[0]}", num_envs=2, **spawned)
     print(envs.reset(seed=1)[0].shape)
     envs.step(envs.action_space.sample())
     envs.close()

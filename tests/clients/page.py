@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from tests.worlds.undone import models_of_pages_forgotten
+from tests.worlds.models import models_of_pages_forgotten
 
 DOCS = Path(__file__).parents[2] / "docs"
 

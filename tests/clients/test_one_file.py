@@ -5,7 +5,7 @@ from importlib import import_module
 import numpy as np
 import torch
 
-from tests.worlds.undone import models_of_pages_forgotten
+from tests.worlds.models import models_of_pages_forgotten
 
 from .page import DOCS
 from .returns import mean_return

@@ -8,14 +8,13 @@ import pettingzoo
 import pytest
 from gymnasium.spaces import Box
 from hive import BEES, DEFINITION, HiveSim
-from hive import points as bees
+from hive import dial_points as bees
 from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
 from simenv_marl import RULE, aec_env, parallel_env
 from simenv_marl.envs import pad_agents
-from tests.worlds.counters import alike
-from tests.worlds.dials import ACTIONS, DialEnv, DialSim, points
+from tests.worlds.vectors import ACTIONS, DialEnv, DialSim, alike, dial_points
 
 from . import page
 from .returns import mean_return
@@ -121,12 +120,13 @@ def test_wrapped_views_match_a_wrapped_hand_written_environment(name):
     arguments, seen = WRAPPERS[name]
 
     def make():
-        return suit[name](aec_env(DialSim, points(seen)), **arguments)
+        return suit[name](aec_env(DialSim, dial_points(seen)), **arguments)
 
     api_test(make(), num_cycles=20)
     seed_test(make, num_cycles=20)
     wrapped, by_hand = (
-        suit[name](env, **arguments) for env in (parallel_env(DialSim, points(seen)), HandEnv(seen))
+        suit[name](env, **arguments)
+        for env in (parallel_env(DialSim, dial_points(seen)), HandEnv(seen))
     )
     assert alike(story_around(wrapped), story_around(by_hand))
 

@@ -1,6 +1,6 @@
 """The contract is tested with every driver."""
 
-from tests.conftest import DRIVERS
+from tests.worlds.models import DRIVERS
 
 
 def pytest_generate_tests(metafunc):

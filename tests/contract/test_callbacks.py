@@ -35,7 +35,7 @@ def _silent(capfd):
 def loops():
     if shutil.which("cc") is None:
         pytest.skip("there is no C compiler")
-    library, source = Path(mkdtemp()) / "loops.so", Path(__file__).parents[1] / "worlds" / "loops.c"
+    library, source = Path(mkdtemp()) / "loops.so", Path(__file__).with_name("loops.c")
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source], check=True, timeout=60)
     return ctypes.CDLL(str(library))
 

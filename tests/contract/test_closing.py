@@ -16,9 +16,7 @@ from simenv_marl import (
 )
 from simenv_marl.data import collect_episodes
 from simenv_marl.experiments import evaluate
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import begun, define
-from tests.worlds.undone import fails
+from tests.worlds.models import EVERY_VIEW, begun, define, fails
 
 BOOK = f"{__name__}.Shop.book"
 LOG = []

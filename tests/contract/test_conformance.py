@@ -16,7 +16,7 @@ from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_para
 
 from simenv_marl import RULE, TRUNCATED, aec_env, clone, generate_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
-from tests.worlds.many_worlds import HERE, ROSTER, Announcing, Design, colony_points
+from tests.worlds.entities import HERE, ROSTER, AnnouncingColony, ColonyDesign, colony_points
 from tests.worlds.models import define, play
 
 OBSERVATION = spaces.Box(-10, 10, (3,), np.float32)
@@ -162,7 +162,7 @@ def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
     options = {} if roster == "unknown" else declared | {"state_space": "observations"}
 
     def make(view, **more):
-        colony = Announcing(Design(initial=4, most=8, ticks=6, overseen="after"))
+        colony = AnnouncingColony(ColonyDesign(initial=4, most=8, ticks=6, overseen="after"))
         env = view(colony, colony_points(overseen=True), **options | more)
         return pad_agents(env) if roster == "padded" else env
 

@@ -17,13 +17,12 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.errors import DefinitionError, RewardError
-from tests.extent import examples
-from tests.worlds import random_worlds as yards
 from tests.worlds.models import calling, decision, define, play, script
+from tests.worlds.random_worlds import YARD_POINTS, YARD_ROSTER, Yard, seeds, yard_designs
 
 FORTUNES = {
     name: (lambda yard: yard.fortune) if "plan" in name else (lambda machine: machine.yard.fortune)
-    for name in yards.POINTS
+    for name in YARD_POINTS
 }
 
 
@@ -41,7 +40,7 @@ def charged(masked):
             cost_mapping=difference(FORTUNES[name]),
             action_mask_mapping=one_in_two if masked else None,
         )
-        for name, definition in yards.POINTS.items()
+        for name, definition in YARD_POINTS.items()
     }
 
 
@@ -67,13 +66,13 @@ def pairs(make, yard, points, options, seed):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-@examples(25)
-@given(design=yards.designs, seed=yards.seeds, skip=st.booleans(), masked=st.booleans())
+@settings(max_examples=25)
+@given(design=yard_designs, seed=seeds, skip=st.booleans(), masked=st.booleans())
 def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
     options = {"skip_forced": skip}
     if make is not aec_env:
-        options["possible_agents"] = yards.ROSTER
-    found = pairs(make, lambda: yards.Yard(design), charged(masked), options, seed)
+        options["possible_agents"] = YARD_ROSTER
+    found = pairs(make, lambda: Yard(design), charged(masked), options, seed)
     assert [cost for _, cost in found] == pytest.approx([reward for reward, _ in found])
 
 

@@ -19,8 +19,7 @@ from simenv_marl.core.plans.options import Options
 from simenv_marl.errors import ClosedError, InvalidActionError
 from tests.core.test_threads import in_a_thread
 from tests.processes import alone
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import alive, begun, decision, script, stacks, step, unwinding
+from tests.worlds.models import EVERY_VIEW, alive, begun, decision, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])

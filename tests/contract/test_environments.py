@@ -17,8 +17,17 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import Script, begun, calling, decision, decisions, define, plainly, play
+from tests.worlds.models import (
+    EVERY_VIEW,
+    Script,
+    begun,
+    calling,
+    decision,
+    decisions,
+    define,
+    plainly,
+    play,
+)
 
 PUMP, FAN = decision(agent="pump_0"), decision(agent="fan_0")
 NAMED = define(agent=lambda name: name)(lambda name: "rule")

@@ -12,11 +12,18 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
-from tests.worlds.counters import same
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import Being, beings
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import begun, calling, decision, decisions, follow_the_rule, play, script
+from tests.worlds.entities import Being, beings, life
+from tests.worlds.models import (
+    EVERY_VIEW,
+    begun,
+    calling,
+    decision,
+    decisions,
+    follow_the_rule,
+    play,
+    script,
+)
+from tests.worlds.vectors import same
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 

@@ -27,9 +27,17 @@ from simenv_marl.errors import (
     short_repr,
 )
 from tests.core.test_threads import in_a_thread
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import begun, calling, decision, notes, play, script, step
-from tests.worlds.undone import fails
+from tests.worlds.models import (
+    EVERY_VIEW,
+    begun,
+    calling,
+    decision,
+    fails,
+    notes,
+    play,
+    script,
+    step,
+)
 
 # -- the tree -------------------------------------------------------------------------------------
 

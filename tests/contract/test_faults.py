@@ -26,17 +26,25 @@ from simenv_marl.errors import NotResetError, ReentrancyError, ResetNeededError
 from simenv_marl.hooks.stacks import EVALUATING
 from tests.core.test_threads import in_a_thread
 from tests.processes import alone
-from tests.worlds import farms
-from tests.worlds.farms import PLAN, POINTS, Beast, Farm, Small, cut_short, farm_env, run, take
-from tests.worlds.marks import EVERY_VIEW, VIEWS
-from tests.worlds.models import culprits, decision, nobody_is_asked, notes, stacks, step
+from tests.worlds import faults
+from tests.worlds.faults import PLAN, POINTS, Beast, Farm, Small, cut_short, farm_env, run, take
+from tests.worlds.models import (
+    EVERY_VIEW,
+    VIEWS,
+    culprits,
+    decision,
+    nobody_is_asked,
+    notes,
+    stacks,
+    step,
+)
 
 ORIGINALS = [dict(vars(Farm)), dict(vars(Beast))]
 
 
-def everywhere(*views, places=farms.PLACES):
+def everywhere(*views, places=faults.PLACES):
     """All of the places that an episode comes by, in these views."""
-    there = [(view, place) for view in views for place in places if farms.comes_by(view, place)]
+    there = [(view, place) for view in views for place in places if faults.comes_by(view, place)]
     return pytest.mark.parametrize(("view", "place"), there)
 
 
@@ -93,7 +101,7 @@ def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
     kinds = list(ERRORS.items())
-    later = [] if place in farms.ONCE else kinds[:6]
+    later = [] if place in faults.ONCE else kinds[:6]
     for time, (kind, make) in [
         *product([1], kinds[: None if view is aec_env else 6]),
         *product([3], later),
@@ -111,7 +119,7 @@ def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
         if place not in ("render", "close"):
             assert "seed 11" in notes(error), kind
         if isinstance(error, Exception):
-            assert farm.caught == (place in farms.IN_THE_MODEL)
+            assert farm.caught == (place in faults.IN_THE_MODEL)
         if place not in ("render", "action"):  # after which the episode goes on
             with pytest.raises(ResetNeededError, match=r"call reset\(\)"):
                 take(env, 0)
@@ -162,16 +170,16 @@ def test_error_note_names_decision_agent_and_seed(view, place, time, where, seed
     is_early = where.startswith(("while", "before", "at decision 1,"))
     if not is_early and place != "action":  # there are answers, and the decision is not pending
         expected += "; save_episode(env, path) writes the episode to a file"
-    assert note.replace(f"{farms.__name__}.", "") == expected
+    assert note.replace(f"{faults.__name__}.", "") == expected
     assert seed in (farm.seed, None)
 
 
 # -- uses from inside -----------------------------------------------------------------------------
 
-INSIDE = [place for place in farms.PLACES if place != "render"]  # which comes after the step
+INSIDE = [place for place in faults.PLACES if place != "render"]  # which comes after the step
 
 
-@everywhere(*VIEWS, farms.vector, farms.vector_of_joint, places=INSIDE)
+@everywhere(*VIEWS, faults.vector, faults.vector_of_joint, places=INSIDE)
 @pytest.mark.parametrize("method", ["step", "reset", "close"])
 def test_reentrant_use_is_refused_and_the_episode_continues(view, place, method):
     def use():
@@ -186,7 +194,7 @@ def test_reentrant_use_is_refused_and_the_episode_continues(view, place, method)
 
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
-    for time in [1, 3] if method == "step" and place not in farms.ONCE else [1]:
+    for time in [1, 3] if method == "step" and place not in faults.ONCE else [1]:
         used = []
         farm.let(use_in_vain, place, time)
         assert run(env) == fresh

@@ -28,11 +28,17 @@ from simenv_marl.errors import (
     OptionValueError,
     ViewError,
 )
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import beings
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import begun, calling, decision, define, play, step
-from tests.worlds.undone import registries_put_back
+from tests.worlds.entities import beings, life
+from tests.worlds.models import (
+    EVERY_VIEW,
+    begun,
+    calling,
+    decision,
+    define,
+    play,
+    registries_put_back,
+    step,
+)
 
 # -- goals ----------------------------------------------------------------------------------------
 

@@ -9,19 +9,17 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
-from tests.extent import examples
-from tests.worlds.marks import VIEWS
-from tests.worlds.models import follow_the_rule
+from tests.worlds.models import VIEWS, follow_the_rule
 from tests.worlds.random_worlds import (
     HERE,
-    PLAN,
-    POINTS,
-    ROSTER,
+    YARD_PLAN,
+    YARD_POINTS,
+    YARD_ROSTER,
     Yard,
-    designs,
-    outcome,
-    plain,
+    plain_yard,
     seeds,
+    yard_designs,
+    yard_outcome,
 )
 
 
@@ -45,26 +43,34 @@ OPTIONS = st.sampled_from(
 def made(view, design, **options):
     """An environment of a yard."""
     if view is joint_env:
-        options["possible_agents"] = ROSTER
+        options["possible_agents"] = YARD_ROSTER
     return view(
-        lambda: Yard(design), PLAN if view is single_env else POINTS, render_mode="ansi", **options
+        lambda: Yard(design),
+        YARD_PLAN if view is single_env else YARD_POINTS,
+        render_mode="ansi",
+        **options,
     )
 
 
 # -- one model, many readings ---------------------------------------------------------------------
 
 
-@given(designs, seeds, OPTIONS)
-@examples(150)
+@given(yard_designs, seeds, OPTIONS)
+@settings(max_examples=150)
 def test_every_view_stepped_with_rule_matches_the_plain_run(design, seed, options):
-    expected = outcome(plain(design, seed))
+    expected = yard_outcome(plain_yard(design, seed))
     for view in VIEWS:
         env = made(view, design, **options)
-        assert outcome(follow_the_rule(env, seed)) == expected, view
+        assert yard_outcome(follow_the_rule(env, seed)) == expected, view
         env.close()
-    assert outcome(simulate(lambda: Yard(design), points=POINTS, seed=seed, **options)) == expected
     assert (
-        outcome(simulate(lambda: Yard(design), dict.fromkeys(POINTS, RULE), seed=seed, **options))
+        yard_outcome(simulate(lambda: Yard(design), points=YARD_POINTS, seed=seed, **options))
+        == expected
+    )
+    assert (
+        yard_outcome(
+            simulate(lambda: Yard(design), dict.fromkeys(YARD_POINTS, RULE), seed=seed, **options)
+        )
         == expected
     )
 
@@ -157,8 +163,10 @@ uses = st.lists(
 )
 
 
-@given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
-@examples(120)
+@given(
+    yard_designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses
+)
+@settings(max_examples=120)
 def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:
@@ -175,7 +183,9 @@ def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequ
         elif what == "err":
             player.err()
         elif what == "plain":
-            assert outcome(plain(design, number)) == outcome(plain(design, number))
+            assert yard_outcome(plain_yard(design, number)) == yard_outcome(
+                plain_yard(design, number)
+            )
         else:
             gc.collect(0)
     for player in players:

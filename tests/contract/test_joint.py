@@ -17,8 +17,7 @@ from simenv_marl.errors import (
     UnknownOptionError,
     ViewError,
 )
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.entities import Being, beings, life
 from tests.worlds.models import calling, decision, unwinding
 
 

@@ -34,8 +34,8 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from tests.core.test_threads import in_a_thread
-from tests.worlds.counters import FORK, FORKS
 from tests.worlds.models import decision, define, nobody_is_asked, script, stacks
+from tests.worlds.vectors import FORK, FORKS
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there is no timer")
 

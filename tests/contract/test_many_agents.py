@@ -25,35 +25,35 @@ from simenv_marl.errors import (
     UnknownAgentError,
     UnknownPointError,
 )
-from tests.extent import examples
-from tests.worlds import lives
-from tests.worlds.lives import life, story
-from tests.worlds.many_worlds import (
+from tests.worlds import entities
+from tests.worlds.entities import (
     HERE,
-    Announcing,
-    Answered,
+    AnnouncingColony,
+    AnsweredColony,
     Being,
     Colony,
     Other,
     being_of,
     beings,
     colony,
-    designs,
+    colony_designs,
+    life,
     others,
-    played,
+    play_colony,
     seeds,
+    story,
 )
 from tests.worlds.models import (
     begun,
     decision,
     decisions,
     define,
+    fails,
     follow_the_rule,
     notes,
     play,
     script,
 )
-from tests.worlds.undone import fails
 
 NAMES = ["being_0", "being_1", "being_2"]
 IN_ORDER = "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 3 health 1, 3 acts"
@@ -455,9 +455,9 @@ def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
 @pytest.mark.parametrize(
     ("removed_by", "error", "match"),
     [
-        ("tests.worlds.many_worlds.Being.vanish", UnknownPointError, "vanish"),
-        (["tests.worlds.many_worlds.Being.leave", "nowhere.leave"], UnknownPointError, "nowhere"),
-        ("tests.worlds.many_worlds.Being.act", DefinitionError, "Being.act"),
+        ("tests.worlds.entities.Being.vanish", UnknownPointError, "vanish"),
+        (["tests.worlds.entities.Being.leave", "nowhere.leave"], UnknownPointError, "nowhere"),
+        ("tests.worlds.entities.Being.act", DefinitionError, "Being.act"),
     ],
 )
 def test_invalid_removals_are_refused(removed_by, error, match):
@@ -508,7 +508,7 @@ def test_error_at_the_end_of_an_agent_names_the_agent(program, whose):
     assert env.agent_selection == "being_0"
 
 
-class Forgetting(lives.Announcing):
+class Forgetting(entities.AnnouncingLife):
     """A life that logs whether a being is gone once it is forgotten."""
 
     def happens(self, number, what, *value):
@@ -571,16 +571,16 @@ def test_outside_an_environment_end_agent_does_nothing():
 # -- everything at once ---------------------------------------------------------------------------
 
 
-@given(designs, seeds)
-@examples(120)
+@given(colony_designs, seeds)
+@settings(max_examples=120)
 def test_random_colony_in_the_aec_view_matches_the_plain_run(design, seed):
-    plain = Answered(design, seed)
+    plain = AnsweredColony(design, seed)
     if not plain.decisions:
         return
-    for simulation in (Colony, Announcing):
+    for simulation in (Colony, AnnouncingColony):
         for roster in (False, True):
             env = colony(aec_env, design, simulation, roster=roster)
-            decided, totals, ends = played(env, seed)
+            decided, totals, ends = play_colony(env, seed)
             assert decided == plain.decisions
             assert env.simulation.trace == plain.trace
             assert env.simulation.random.getstate() == plain.random.getstate()

@@ -30,11 +30,9 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
-from tests.worlds.counters import same
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import beings
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import begun, calling, decision, play
+from tests.worlds.entities import beings, life
+from tests.worlds.models import EVERY_VIEW, begun, calling, decision, play
+from tests.worlds.vectors import same
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}

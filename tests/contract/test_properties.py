@@ -7,22 +7,22 @@ from simenv_marl import RULE, aec_env
 from simenv_marl.errors import EpisodeOverError
 from tests.extent import examples
 from tests.worlds.models import play
-from tests.worlds.worlds import (
+from tests.worlds.random_worlds import (
     Reference,
     World,
-    advised,
     answers,
-    designs,
     legal,
     points_of,
     seeds,
+    world_designs,
+    world_policy,
 )
 
 
 def made(design):
     """An environment of a design."""
     points = points_of(design)
-    policies = {points[point]: advised for point in design.policies} | {
+    policies = {points[point]: world_policy for point in design.policies} | {
         points[point]: RULE for point in design.rules
     }
     return aec_env(
@@ -57,8 +57,8 @@ def agrees(env, reference):
     assert env.agents == []
 
 
-@given(designs(), seeds, answers)
-@examples(300)
+@given(world_designs(), seeds, answers)
+@settings(max_examples=300)
 def test_random_episodes_match_a_reference_implementation(design, seed, given_answers):
     """Also the rewards that each step books: none is lost or counted twice."""
     env = made(design)

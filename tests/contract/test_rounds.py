@@ -18,16 +18,15 @@ from simenv_marl.errors import (
     NotResetError,
     UnknownAgentError,
 )
-from tests.extent import examples
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import (
-    Announcing,
-    Answered,
+from tests.worlds.entities import (
+    AnnouncingColony,
+    AnsweredColony,
     Colony,
     answer,
     beings,
     colony,
-    designs,
+    colony_designs,
+    life,
     seeds,
 )
 from tests.worlds.models import calling, decision, define, notes, script
@@ -448,16 +447,16 @@ def played(env, seed, in_turns):
     return totals, joined, ended
 
 
-@given(designs, seeds)
-@examples(60)
+@given(colony_designs, seeds)
+@settings(max_examples=60)
 def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
-    plain = Answered(design, seed)
+    plain = AnsweredColony(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
     for simulation, roster, in_turns in (
         (Colony, False, False),
         (Colony, True, False),
-        (Announcing, False, False),
-        (Announcing, False, True),
+        (AnnouncingColony, False, False),
+        (AnnouncingColony, False, True),
     ):
         env = colony(parallel_env, design, simulation, roster=roster)
         if not plain.decisions:
@@ -468,9 +467,9 @@ def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
         assert env.simulation.trace == plain.trace
         assert env.simulation.random.getstate() == plain.random.getstate()
         for agent in plain.first:
-            since = joined[agent] if simulation is Announcing else plain.first[agent]
+            since = joined[agent] if simulation is AnnouncingColony else plain.first[agent]
             assert totals[agent] == plain.last[agent] - since
-        assert simulation is Announcing or not any(
+        assert simulation is AnnouncingColony or not any(
             totals[agent] for agent in totals.keys() - plain.first.keys()
         )
         assert set(ended) >= set(plain.first)

@@ -16,23 +16,20 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
-from tests.conftest import DRIVERS
-from tests.extent import examples
-from tests.worlds.duels import LEFT, Duel, points
-from tests.worlds.many_worlds import (
+from tests.worlds.entities import (
     HERE,
-    Answered,
+    AnsweredColony,
     Being,
     Colony,
     Other,
-    advised,
     beings,
+    colony_designs,
     colony_points,
-    designs,
+    colony_policy,
     seeds,
 )
-from tests.worlds.models import calling, decision, notes, script
-from tests.worlds.undone import fails
+from tests.worlds.models import DRIVERS, calling, decision, fails, notes, script
+from tests.worlds.valued import LEFT, Duel, points
 
 
 def test_simulate_without_policies_is_the_plain_run_of_a_copy():
@@ -94,14 +91,14 @@ def test_simulate_refuses_invalid_arguments(run, arguments, error, match):
         run(**{"simulation": calling(ANT), "policies": None, "points": ANT} | arguments)
 
 
-@given(designs, seeds)
-@examples(40)
+@given(colony_designs, seeds)
+@settings(max_examples=40)
 def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
-    plain = Answered(design, seed)
+    plain = AnsweredColony(design, seed)
     points = colony_points(overseen=bool(design.overseen))
 
     def policy(observation, info):
-        return advised(observation, seed)
+        return colony_policy(observation, seed)
 
     by_point = {f"{HERE}.Creature.act": policy} | (
         {Colony.oversee: policy} if design.overseen else {}

@@ -16,11 +16,9 @@ from simenv_marl import RULE, evaluate, simulate, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import InvalidActionError, MissingExtraError, OptionValueError
 from simenv_marl.experiments import run_experiment
-from tests.extent import examples
-from tests.worlds import worlds
-from tests.worlds.counters import same
-from tests.worlds.models import calling, decision, define, notes, plainly, script, stacks
-from tests.worlds.undone import fails
+from tests.worlds.models import calling, decision, define, fails, notes, plainly, script, stacks
+from tests.worlds.random_worlds import World, points_of, world_designs, world_policy
+from tests.worlds.vectors import same
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=12)
 sizes = st.integers(1, 14)
@@ -61,19 +59,17 @@ class Going:
 going = {Going.decide: define(agent="going_0")}
 
 
-@given(worlds.designs(), some_seeds, sizes)
-@examples(60)
+@given(world_designs(), some_seeds, sizes)
+@settings(max_examples=60)
 def test_simulate_many_matches_simulate_one_by_one(design, seeds, size):
     """All kinds of decision points: nested, generators, with choices, of entities, named late."""
 
     def source():
-        return worlds.World(design, points)
+        return World(design, points)
 
-    points = worlds.points_of(design)
+    points = points_of(design)
     one = {
-        points[number]: worlds.advised
-        for number in range(len(points))
-        if number not in design.rules
+        points[number]: world_policy for number in range(len(points)) if number not in design.rules
     }
     many = {point: by_row(policy) for point, policy in one.items()}
     found = simulate_many(source, many, seeds=seeds, points=points, batch_size=size)

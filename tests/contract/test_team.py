@@ -15,9 +15,8 @@ from simenv_marl import (
     turn_env,
 )
 from simenv_marl.errors import OptionValueError, RewardError
-from tests.extent import examples
-from tests.worlds import random_worlds as yards
 from tests.worlds.models import calling, decision, define, play, script
+from tests.worlds.random_worlds import YARD_POINTS, YARD_ROSTER, Yard, seeds, yard_designs
 
 CLOSE = {"rel": 1e-9, "abs": 1e-6}
 
@@ -114,15 +113,15 @@ def earned(yard):
     return yard.fortune + 10.0 * yard.built
 
 
-@given(yards.designs, yards.seeds)
-@examples(60)
+@given(yard_designs, seeds)
+@settings(max_examples=60)
 def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
     options = {
-        "possible_agents": yards.ROSTER,
+        "possible_agents": YARD_ROSTER,
         "team_reward": difference(earned),
     }
     for view in ("turn", "joint"):
-        env = generate_env(lambda: yards.Yard(design), yards.POINTS, view=view, **options)()
+        env = generate_env(lambda: Yard(design), YARD_POINTS, view=view, **options)()
         env.reset(seed=seed)
         before = earned(env.simulation)
         total, ended = 0.0, False
@@ -132,7 +131,7 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
             ended = terminated or truncated
         assert total == pytest.approx(earned(env.simulation) - before, **CLOSE)
         env.close()
-    aec = aec_env(lambda: yards.Yard(design), yards.POINTS, **options)
+    aec = aec_env(lambda: Yard(design), YARD_POINTS, **options)
     begins = {}
     totals = {}
     ends = {}
@@ -154,13 +153,13 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
     aec.close()
 
 
-@given(yards.designs, yards.seeds)
-@examples(30)
+@given(yard_designs, seeds)
+@settings(max_examples=30)
 def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, seed):
     env = parallel_env(
-        lambda: yards.Yard(design),
-        yards.POINTS,
-        possible_agents=yards.ROSTER,
+        lambda: Yard(design),
+        YARD_POINTS,
+        possible_agents=YARD_ROSTER,
         team_reward=difference(earned),
     )
     env.reset(seed=seed)

@@ -10,9 +10,7 @@ from hypothesis import given
 
 from simenv_marl import RULE, aec_env, clone, generate_env, turn_env, vector_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError, UnknownOptionError, ViewError
-from tests.extent import examples
-from tests.worlds import random_worlds as yards
-from tests.worlds import worlds
+from tests.worlds import random_worlds
 from tests.worlds.models import Timed, calling, decision, script
 
 
@@ -68,32 +66,32 @@ def compared(aec, turn, seed, action_of):
     turn.close()
 
 
-@given(yards.designs, yards.seeds)
-@examples(60)
+@given(random_worlds.yard_designs, random_worlds.seeds)
+@settings(max_examples=60)
 def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
-    options = {"possible_agents": yards.ROSTER}
+    options = {"possible_agents": random_worlds.YARD_ROSTER}
     compared(
-        aec_env(lambda: yards.Yard(design), yards.POINTS, **options),
-        turn_env(lambda: yards.Yard(design), yards.POINTS, **options),
+        aec_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
+        turn_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
         seed,
-        lambda observation, info: yards.advised(observation),
+        lambda observation, info: random_worlds.yard_policy(observation),
     )
 
 
-@given(worlds.designs(), worlds.seeds, worlds.answers)
-@examples(100)
+@given(random_worlds.world_designs(), random_worlds.seeds, random_worlds.answers)
+@settings(max_examples=100)
 def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
-    points = worlds.points_of(design)
-    policies = {points[point]: worlds.advised for point in design.policies} | {
+    points = random_worlds.points_of(design)
+    policies = {points[point]: random_worlds.world_policy for point in design.policies} | {
         points[point]: RULE for point in design.rules
     }
     options = {"policies": policies or None, "max_steps": design.max_steps}
     given_answers = iter(answers)
     compared(
-        aec_env(lambda: worlds.World(design, points), points, **options),
-        turn_env(lambda: worlds.World(design, points), points, **options),
+        aec_env(lambda: random_worlds.World(design, points), points, **options),
+        turn_env(lambda: random_worlds.World(design, points), points, **options),
         seed,
-        lambda observation, info: worlds.legal(
+        lambda observation, info: random_worlds.legal(
             next(given_answers), {k: v for k, v in info.items() if k == "action_mask"}
         ),
     )
@@ -267,8 +265,12 @@ def test_the_last_observation_is_that_of_the_agent_that_decided_last():
 
 
 def test_clone_of_a_turn_view_continues_like_the_original():
-    design = yards.Design(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
-    env = turn_env(lambda: yards.Yard(design), yards.POINTS, possible_agents=yards.ROSTER)
+    design = random_worlds.YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
+    env = turn_env(
+        lambda: random_worlds.Yard(design),
+        random_worlds.YARD_POINTS,
+        possible_agents=random_worlds.YARD_ROSTER,
+    )
     env.reset(seed=5)
     env.step(2)
     clones = [clone(env, method=method) for method in (None, "replay")]

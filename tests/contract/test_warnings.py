@@ -23,8 +23,7 @@ from simenv_marl import (
 )
 from simenv_marl.core.switching import generators as rng
 from simenv_marl.errors import UnknownPointError
-from tests.worlds.lives import life, story
-from tests.worlds.many_worlds import HERE, Being, beings
+from tests.worlds.entities import HERE, Being, beings, life, story
 from tests.worlds.models import begun, calling, decision, define, script
 from tests.worlds.models import play as play_in_turns
 

@@ -19,8 +19,8 @@ from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.processes import run_code
-from tests.worlds.marks import EVERY_DRIVER
 from tests.worlds.models import (
+    EVERY_DRIVER,
     Script,
     begun,
     calling,

@@ -11,9 +11,7 @@ import pytest
 
 from simenv_marl import SimulationInterface, single_env
 from simenv_marl.errors import SimulationError
-from tests.conftest import DRIVERS
-from tests.worlds.marks import EVERY_DRIVER
-from tests.worlds.models import begun, decision, script
+from tests.worlds.models import DRIVERS, EVERY_DRIVER, begun, decision, script
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 

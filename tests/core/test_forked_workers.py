@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from tests.conftest import DRIVERS
 from tests.processes import run_code
+from tests.worlds.models import DRIVERS
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform does not fork")
 

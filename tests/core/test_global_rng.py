@@ -8,8 +8,7 @@ import pytest
 
 from simenv_marl import RULE, TRUNCATED, aec_env, simulate
 from simenv_marl.errors import OptionValueError, WrongThreadError
-from tests.worlds.marks import EVERY_DRIVER, EVERY_VIEW
-from tests.worlds.models import begun, define, play
+from tests.worlds.models import EVERY_DRIVER, EVERY_VIEW, begun, define, play
 
 
 class Casino:

@@ -11,9 +11,8 @@ import pytest
 from simenv_marl import RULE, aec_env, single_env
 from simenv_marl.core.switching import threads
 from simenv_marl.errors import ReentrancyError
-from tests.worlds import farms
-from tests.worlds.marks import EVERY_VIEW
-from tests.worlds.models import calling, decision, notes, script, step
+from tests.worlds import faults
+from tests.worlds.models import EVERY_VIEW, calling, decision, notes, script, step
 
 
 def in_a_thread(function, *args):
@@ -52,15 +51,20 @@ def older_threads():
 # -- where it runs --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", farms.PLACES)
+@pytest.mark.parametrize("place", faults.PLACES)
 def test_a_simulation_has_one_thread_and_mappings_run_in_the_users(place, older_threads):
-    env, farm = farms.farm_env(aec_env, place, driver="thread")
+    env, farm = faults.farm_env(aec_env, place, driver="thread")
     (own,) = set(simulation_threads()) - set(older_threads)
     seen = set()
-    for number, play_on in ((1, farms.run), (3, farms.run), (9, farms.run), (1, farms.cut_short)):
+    for number, play_on in (
+        (1, faults.run),
+        (3, faults.run),
+        (9, faults.run),
+        (1, faults.cut_short),
+    ):
         farm.let(lambda: seen.add(threading.current_thread()), place, number)
         play_on(env)
-    inside = place in (*farms.IN_THE_MODEL, "reset", "finally", "close")
+    inside = place in (*faults.IN_THE_MODEL, "reset", "finally", "close")
     assert seen == {own if inside else threading.current_thread()}
 
 
@@ -102,23 +106,23 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, pl
         assert go_on.wait(10)
 
     (env, farm), (other, undisturbed) = (
-        farms.farm_env(view, place, driver="thread") for _ in range(2)
+        faults.farm_env(view, place, driver="thread") for _ in range(2)
     )
     env.reset(seed=11)
     farm.let(wait, place)
-    stepping = threading.Thread(target=farms.take, args=(env, RULE))
+    stepping = threading.Thread(target=faults.take, args=(env, RULE))
     stepping.start()
     assert inside.wait(10)
     with pytest.raises(ReentrancyError, match="another thread"):
-        farms.take(env, 0) if what == "step" else getattr(env, what)()
+        faults.take(env, 0) if what == "step" else getattr(env, what)()
     go_on.set()
     stepping.join()
     other.reset(seed=11)
-    farms.take(other, RULE)
+    faults.take(other, RULE)
     for _ in range(2):
         assert farm.log == undisturbed.log
-        farms.take(env, 0)
-        farms.take(other, 0)
+        faults.take(env, 0)
+        faults.take(other, 0)
 
 
 # -- what is left behind --------------------------------------------------------------------------

@@ -13,20 +13,19 @@ from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row, ones
-from tests.extent import examples
-from tests.worlds import worlds
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import (
-    Announcing,
+from tests.worlds.entities import (
+    AnnouncingColony,
     Being,
     Colony,
     Other,
     beings,
+    colony_designs,
     colony_points,
-    designs,
+    life,
     others,
 )
 from tests.worlds.models import Timed, calling, decision, play, script
+from tests.worlds.random_worlds import World, points_of, world_designs, world_policy
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
 sizes = st.integers(1, 8)
@@ -101,15 +100,15 @@ def check(found, episodes, chosen):
     assert (len(found), len(found.starts)) == (row, trajectory)
 
 
-@given(designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
-@examples(60)
+@given(colony_designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
+@settings(max_examples=60)
 def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
     def policy(observation, info):
         number = int(observation.sum()) % 6
         return RULE if number == 5 else number
 
     def simulation():
-        return (Announcing if announcing else Colony)(design)
+        return (AnnouncingColony if announcing else Colony)(design)
 
     points = colony_points(overseen=bool(design.overseen))
     given = {"points": points, "max_steps": most}
@@ -126,22 +125,22 @@ def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, 
         check(found[point], episodes, lambda agent: agent == "overseer_0")
 
 
-@given(worlds.designs(), some_seeds, sizes)
-@examples(80)
+@given(world_designs(), some_seeds, sizes)
+@settings(max_examples=80)
 def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
     def simulation():
-        return worlds.World(design, points)
+        return World(design, points)
 
-    points = worlds.points_of(design)
+    points = points_of(design)
     given = {"points": points, "max_steps": design.max_steps}
     answered = {
-        points[number]: by_row(worlds.advised)
+        points[number]: by_row(world_policy)
         for number in range(len(points))
         if number not in design.rules
     }
     found = collect_episodes(simulation, answered, seeds=seeds, batch_size=size, **given)
     env = aec_env(simulation, policies={points[number]: RULE for number in design.rules}, **given)
-    episodes = [played(env, lambda agent: worlds.advised, seed) for seed in seeds]
+    episodes = [played(env, lambda agent: world_policy, seed) for seed in seeds]
     for number, point in enumerate(points):
         if point in answered:
             check(

@@ -20,8 +20,7 @@ from simenv_marl.data import (
 )
 from simenv_marl.errors import DefinitionError, MissingExtraError, OptionValueError
 from tests.contract.test_simulate_many import ones
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.entities import Being, beings, life
 from tests.worlds.models import calling, decision, plainly, script
 
 

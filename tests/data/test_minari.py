@@ -12,10 +12,9 @@ from simenv_marl import RULE, TRUNCATED
 from simenv_marl.data import Mixture, collect_episodes, record_dataset, save_dataset
 from simenv_marl.errors import DefinitionError, OptionValueError
 from tests.contract.test_simulate_many import ones
-from tests.worlds.counters import same
-from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import Timed, calling, decision, script
-from tests.worlds.undone import models_of_pages_forgotten
+from tests.worlds.entities import Being, beings
+from tests.worlds.models import Timed, calling, decision, models_of_pages_forgotten, script
+from tests.worlds.vectors import same
 
 minari = pytest.importorskip("minari")
 

@@ -17,7 +17,7 @@ from simenv_marl.data.plots import COLOURS
 from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.contract.test_simulate_many import ones
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.entities import Being, beings
 from tests.worlds.models import Timed, calling, decision, script
 
 

@@ -9,11 +9,8 @@ from gymnasium import spaces
 from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import InvalidActionError
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import beings
-from tests.worlds.marks import EVERY_DRIVER
-from tests.worlds.models import calling, decision, play, script
-from tests.worlds.undone import fails
+from tests.worlds.entities import beings, life
+from tests.worlds.models import EVERY_DRIVER, calling, decision, fails, play, script
 
 
 def in_turn(values):

@@ -34,19 +34,19 @@ from tests.extent import examples
 from tests.worlds.models import calling, decision, play
 from tests.worlds.random_worlds import (
     HERE,
-    PLAN,
-    POINTS,
-    ROSTER,
-    Design,
+    YARD_PLAN,
+    YARD_POINTS,
+    YARD_ROSTER,
     Yard,
-    advised,
-    designs,
-    outcome,
+    YardDesign,
     seeds,
+    yard_designs,
+    yard_outcome,
+    yard_policy,
 )
 
 SPACE = spaces.Box(0, 1e4, (2,), np.float32)
-BUSY = Design(machines=3, jobs=2, cranes=2, plans=2, luck=2, until=None)
+BUSY = YardDesign(machines=3, jobs=2, cranes=2, plans=2, luck=2, until=None)
 PLANS = f"{HERE}.Yard.plan"
 
 
@@ -59,7 +59,7 @@ def by_row(policy):
 
 
 def everywhere(policy):
-    return dict.fromkeys(POINTS, policy)
+    return dict.fromkeys(YARD_POINTS, policy)
 
 
 def checking(observations, infos, *, _state):
@@ -67,24 +67,24 @@ def checking(observations, infos, *, _state):
     assert _state.shape == (len(observations), 2)
     assert _state[:, 0].tolist() == observations[:, 2].tolist()
     assert _state[:, 1].tolist() == [info["time"] for info in infos]
-    return list(map(advised, observations)), {"seen": _state.copy()}
+    return list(map(yard_policy, observations)), {"seen": _state.copy()}
 
 
 def checking_one(observation, info, *, _state):
     assert _state.tolist() == [observation[2], info["time"]]
-    return advised(observation)
+    return yard_policy(observation)
 
 
 # -- trajectories ---------------------------------------------------------------------------------
 
 
-@given(designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
-@examples(40)
+@given(yard_designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
+@settings(max_examples=40)
 def test_trajectories_have_the_states_at_decisions_and_ends(design, several, size, most):
     found = collect_episodes(
         lambda: Yard(design),
-        everywhere(by_row(advised)),
-        points=POINTS,
+        everywhere(by_row(yard_policy)),
+        points=YARD_POINTS,
         seeds=several,
         batch_size=size,
         max_steps=most,
@@ -103,26 +103,28 @@ def test_trajectories_have_the_states_at_decisions_and_ends(design, several, siz
             assert each.next_states[:, 1].tolist() == (each.times + each.elapsed).tolist()
 
 
-@given(designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
-@examples(20)
+@given(yard_designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
+@settings(max_examples=20)
 def test_states_of_observations_match_an_aec_environment(design, several, whose):
     options = {
-        "points": POINTS,
+        "points": YARD_POINTS,
         "max_steps": 12,
-        "possible_agents": ROSTER,
+        "possible_agents": YARD_ROSTER,
         "state_space": "observations",
     }
-    keys = [*(key for key in POINTS if key != PLANS), "planner"]
+    keys = [*(key for key in YARD_POINTS if key != PLANS), "planner"]
     if whose != "all":
         keys.remove("planner")
     if whose == "names":
         keys = ["load_0", "load_1", "pace_1"]
     found = collect_episodes(
-        lambda: Yard(design), dict.fromkeys(keys, by_row(advised)), seeds=several, **options
+        lambda: Yard(design), dict.fromkeys(keys, by_row(yard_policy)), seeds=several, **options
     )
     others = {} if whose == "all" else {"planner": RULE}
     if whose == "names":
-        others |= {name: RULE for names in ROSTER.values() for name in names if name not in keys}
+        others |= {
+            name: RULE for names in YARD_ROSTER.values() for name in names if name not in keys
+        }
     env = aec_env(lambda: Yard(design), policies=others, **options)
     expected = {}
     for number, seed in enumerate(several):
@@ -130,7 +132,7 @@ def test_states_of_observations_match_an_aec_environment(design, several, whose)
         def answer(agent, env, number=number):
             observation, *_, info = env.last()
             expected[number, agent, info["time"], observation[2]] = env.state()
-            return advised(observation)
+            return yard_policy(observation)
 
         with suppress(NoDecisionError):
             list(play(env, answer, seed=seed))
@@ -146,8 +148,8 @@ def test_state_is_not_called_where_no_result_or_policy_uses_it():
         def state(self):
             raise AssertionError
 
-    given = {"points": POINTS, "seeds": range(3)}
-    policies = everywhere(by_row(advised))
+    given = {"points": YARD_POINTS, "seeds": range(3)}
+    policies = everywhere(by_row(yard_policy))
     for each in collect_episodes(lambda: Silent(BUSY), policies, **given).values():
         assert each.states is each.last_states is each.next_states is None
     simulate_many(lambda: Silent(BUSY), policies, state_space=SPACE, **given)
@@ -157,7 +159,9 @@ def test_state_is_not_called_where_no_result_or_policy_uses_it():
 def test_workers_find_the_same_states():
     policies = {PLANS: RULE, f"{HERE}.Machine.load": checking, f"{HERE}.Machine.pace": checking}
     alone, one, two = (
-        collect_episodes(busy, policies, points=POINTS, seeds=range(7), batch_size=2, workers=n)
+        collect_episodes(
+            busy, policies, points=YARD_POINTS, seeds=range(7), batch_size=2, workers=n
+        )
         for n in (0, 1, 2)
     )
     for key, found in alone.items():
@@ -167,7 +171,9 @@ def test_workers_find_the_same_states():
         if key != PLANS:
             assert np.array_equal(found.states, found.extras["seen"])
     many = [
-        simulate_many(busy, policies, points=POINTS, seeds=range(7), workers=n, collect=outcome)
+        simulate_many(
+            busy, policies, points=YARD_POINTS, seeds=range(7), workers=n, collect=yard_outcome
+        )
         for n in (0, 1)
     ]
     assert many[0] == many[1]
@@ -179,8 +185,8 @@ def test_states_of_ends_are_recorded_with_plugins_and_either_driver():
         for driver in ("greenlet", "thread"):
             found = collect_episodes(
                 busy,
-                everywhere(by_row(advised)),
-                points=POINTS,
+                everywhere(by_row(yard_policy)),
+                points=YARD_POINTS,
                 seeds=range(3),
                 driver=driver,
                 global_rng=True,
@@ -197,7 +203,7 @@ def test_data_sets_contain_states(tmp_path, monkeypatch):
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     policies = {"planner": by_row(lambda observation: 2)}
-    given = {"points": PLAN, "seeds": range(3), "state_space": SPACE}
+    given = {"points": YARD_PLAN, "seeds": range(3), "state_space": SPACE}
     dataset = record_dataset("yard/plans-v0", busy, policies, **given)
     found = collect_episodes(busy, policies, **given)["planner"]
     for number, start in enumerate(found.starts):
@@ -211,11 +217,13 @@ def test_data_sets_contain_states(tmp_path, monkeypatch):
 
 
 def traces(policies, **options):
-    return simulate_many(busy, policies, points=POINTS, seeds=range(5), collect=outcome, **options)
+    return simulate_many(
+        busy, policies, points=YARD_POINTS, seeds=range(5), collect=yard_outcome, **options
+    )
 
 
 def test_batched_policies_get_stacked_states():
-    expected = traces(everywhere(by_row(advised)))
+    expected = traces(everywhere(by_row(yard_policy)))
 
     def third(observations, infos, identities, *, _state):
         assert len(identities) == len(_state)
@@ -223,7 +231,7 @@ def test_batched_policies_get_stacked_states():
 
     def first(observations, *, _state):
         assert _state[:, 0].tolist() == observations[:, 2].tolist()
-        return list(map(advised, observations))
+        return list(map(yard_policy, observations))
 
     for policy in (checking, third, first):
         assert traces(everywhere(policy)) == expected
@@ -232,7 +240,7 @@ def test_batched_policies_get_stacked_states():
         busy,
         {"states": everywhere(checking), "plain": everywhere(first)},
         seeds=range(4),
-        points=POINTS,
+        points=YARD_POINTS,
         batched=True,
     )
     values = found.values("return")
@@ -248,26 +256,28 @@ def test_policies_that_answer_one_decision_get_its_state():
         assert _state[1] == _decision.time
         return checking_one(observation, info, _state=_state)
 
-    plain = everywhere(advised)
-    expected = outcome(simulate(busy, plain, points=POINTS, seed=3))
+    plain = everywhere(yard_policy)
+    expected = yard_outcome(simulate(busy, plain, points=YARD_POINTS, seed=3))
     for policy in (checking_one, waiting, described):
         policies = everywhere(policy)
-        assert outcome(simulate(busy, policies, points=POINTS, seed=3)) == expected
+        assert yard_outcome(simulate(busy, policies, points=YARD_POINTS, seed=3)) == expected
     for policy in (waiting, described):
         assert traces(everywhere(policy))[3] == expected
-        found = collect_episodes(busy, everywhere(policy), points=POINTS, seeds=range(2))[PLANS]
+        found = collect_episodes(busy, everywhere(policy), points=YARD_POINTS, seeds=range(2))[
+            PLANS
+        ]
         assert found.states[:, 0].tolist() == found.observations[:, 2].tolist()
-    machines = {key: checking_one for key in POINTS if key != PLANS}
+    machines = {key: checking_one for key in YARD_POINTS if key != PLANS}
     for driver in ("greenlet", "thread"):
-        env = aec_env(busy, POINTS, policies=machines, driver=driver)
-        list(play(env, lambda agent, env: advised(env.last()[0]), seed=3))
-        assert outcome(env.simulation) == expected
+        env = aec_env(busy, YARD_POINTS, policies=machines, driver=driver)
+        list(play(env, lambda agent, env: yard_policy(env.last()[0]), seed=3))
+        assert yard_outcome(env.simulation) == expected
         env.close()
     found = evaluate(
         busy,
         {"states": everywhere(checking_one), "plain": plain},
         seeds=range(3),
-        points=POINTS,
+        points=YARD_POINTS,
     )
     values = found.values("return")
     assert values["states"].tolist() == values["plain"].tolist()
@@ -278,14 +288,14 @@ def test_policies_get_the_states_of_branches():
 
     def trying(observation, *, _environment):
         seen.append(branch(_environment, look))
-        return advised(observation)
+        return yard_policy(observation)
 
     def look(env, number):
         env.step(1)
         return env.state().tolist()
 
-    machines = {key: checking for key in POINTS if key != PLANS}
-    expected = traces(everywhere(by_row(advised)))
+    machines = {key: checking for key in YARD_POINTS if key != PLANS}
+    expected = traces(everywhere(by_row(yard_policy)))
     assert traces({**machines, PLANS: trying}) == expected
     assert len(seen) > 5
 
@@ -296,23 +306,25 @@ def test_mixtures_and_comparisons_pass_states_on():
         return np.full(len(observations), 2)
 
     mixture = Mixture({checking: 0.5, two: 0.3, RULE: 0.2})
-    found = collect_episodes(busy, {"planner": mixture}, points=POINTS, seeds=range(6))["planner"]
+    found = collect_episodes(busy, {"planner": mixture}, points=YARD_POINTS, seeds=range(6))[
+        "planner"
+    ]
     assert set(found.extras["component"]) == {0, 1, 2}
     assert found.states[:, 1].tolist() == found.times.tolist()
     compared = compare_with_rule(
         busy,
         {"planner": checking},
-        points={PLANS: replace(POINTS[PLANS], rule_action_mapping=int)},
+        points={PLANS: replace(YARD_POINTS[PLANS], rule_action_mapping=int)},
         seeds=range(4),
     )["planner"]
     assert compared.trajectories.by_rule.all()
     assert compared.trajectories.states is not None
     assert Mixture({two: 1}).takes_state
-    assert not Mixture({by_row(advised): 1}).takes_state
+    assert not Mixture({by_row(yard_policy): 1}).takes_state
 
 
 def test_deployed_policies_get_states():
-    env = turn_env(busy, POINTS)
+    env = turn_env(busy, YARD_POINTS)
 
     def one(observation, info, *, _state):
         return checking_one(observation["observation"], info, _state=_state)
@@ -321,19 +333,19 @@ def test_deployed_policies_get_states():
         assert _state[:, 0].tolist() == observations["observation"][:, 2].tolist()
         return np.full(len(_state), 3)
 
-    expected = traces(everywhere(by_row(advised)))
+    expected = traces(everywhere(by_row(yard_policy)))
     assert traces(turn_policy(one, like=env)) == expected
     constant = traces(everywhere(by_row(lambda observation: 3)))
     assert traces(turn_policy(many, like=env, batched=True)) == constant
 
-    joint = joint_env(busy, PLAN)
+    joint = joint_env(busy, YARD_PLAN)
     seen = []
 
     def together(observation, info, *, _state):
         seen.append(_state[0] == observation["planner"][2])
         return {"planner": 2}
 
-    simulate(busy, joint_policy(together, like=joint), points=PLAN, seed=1)
+    simulate(busy, joint_policy(together, like=joint), points=YARD_PLAN, seed=1)
     assert seen
     assert all(seen)
 
@@ -350,19 +362,19 @@ def test_deployed_policies_get_states():
 
 
 def test_states_of_observations_need_known_agents():
-    policies = everywhere(by_row(advised))
-    given = {"points": POINTS, "seeds": range(2), "state_space": "observations"}
+    policies = everywhere(by_row(yard_policy))
+    given = {"points": YARD_POINTS, "seeds": range(2), "state_space": "observations"}
     with pytest.raises(OptionValueError, match="possible_agents="):
         collect_episodes(busy, policies, **given)
     with pytest.raises(OptionValueError, match="possible_agents="):
         simulate_many(busy, everywhere(checking), **given)
-    few = {point: names[:1] for point, names in ROSTER.items()}
+    few = {point: names[:1] for point, names in YARD_ROSTER.items()}
     with pytest.raises(AgentError, match="possible_agents= lacks 'load_"):
         collect_episodes(busy, policies, possible_agents=few, **given)
-    named = {"planner": by_row(advised)}
-    found = collect_episodes(busy, named, **(given | {"points": PLAN}))["planner"]
+    named = {"planner": by_row(yard_policy)}
+    found = collect_episodes(busy, named, **(given | {"points": YARD_PLAN}))["planner"]
     assert found.states.tolist() == found.observations.tolist()
-    assert collect_episodes(busy, policies, **given, possible_agents=ROSTER)
+    assert collect_episodes(busy, policies, **given, possible_agents=YARD_ROSTER)
 
 
 def test_states_that_cannot_be_stacked_are_refused():
@@ -370,8 +382,8 @@ def test_states_that_cannot_be_stacked_are_refused():
         def state(self):
             return self.trace and [0.0] * (1 + len(self.trace))
 
-    policies = everywhere(by_row(advised))
-    given = {"points": POINTS, "seeds": range(3)}
+    policies = everywhere(by_row(yard_policy))
+    given = {"points": YARD_POINTS, "seeds": range(3)}
     for workers in (0, 1):
         with pytest.raises(ObservationError, match="same shape"):
             collect_episodes(

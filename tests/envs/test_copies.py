@@ -14,7 +14,7 @@ from simenv_marl.envs import SimulationAECEnv
 from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
 from tests.processes import python
-from tests.worlds.copied import Walk, WalkEnv, blow, define
+from tests.worlds.copied import Walk, WalkEnv, blow, define_walk
 
 VIEWS = {
     make.__name__: partial(make, Walk, Walk.choose)
@@ -111,7 +111,7 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
 @COPIES
 def test_a_copy_has_all_options(copied, driver):
     """Undecorated points, policies, plugins, variants, rosters and all other options."""
-    points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0"), Walk.choose: None}
+    points = {f"{Walk.__module__}.Walk.drift": define_walk(agent="wind_0"), Walk.choose: None}
     variant = Variant(
         "long", Walk, parameters={"length": 7}, plugins=[(blow, Walk.drift, "instead")]
     )

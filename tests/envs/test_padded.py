@@ -13,22 +13,22 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import UnknownAgentError, ViewError
-from tests.worlds.lives import life
-from tests.worlds.many_worlds import (
+from tests.worlds.entities import (
     HERE,
     ROSTER,
-    Announcing,
-    Answered,
+    AnnouncingColony,
+    AnsweredColony,
     Colony,
     beings,
+    colony_designs,
     colony_points,
-    designs,
-    played,
+    life,
+    play_colony,
     seeds,
 )
 from tests.worlds.models import begun, decision, script
 
-EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
+EVERYBODY = st.tuples(colony_designs, seeds, st.sampled_from([Colony, AnnouncingColony]))
 
 
 def colony(design, kind, view, padded=False):
@@ -56,10 +56,10 @@ def test_padded_aec_selects_live_agents_only(world):
     design, seed, kind = world
     env = colony(design, kind, aec_env, padded=True)
     everybody = sorted(env.possible_agents)
-    decided, totals, ends = played(env, seed, look)
+    decided, totals, ends = play_colony(env, seed, look)
     assert sorted(env.possible_agents) == everybody
     assert env.agents == []
-    plain = Answered(design, seed)
+    plain = AnsweredColony(design, seed)
     assert decided == plain.decisions
     assert env.simulation.trace == plain.trace
     assert totals == dict.fromkeys(everybody, 0.0) | plain.totals

@@ -20,9 +20,9 @@ from gymnasium.vector import AutoresetMode
 from simenv_marl import vector_env
 from simenv_marl.errors import OptionValueError, WorkerError
 from simenv_marl.many import restarts
-from tests.conftest import DRIVERS
 from tests.processes import alone, descriptors
-from tests.worlds.counters import (
+from tests.worlds.models import DRIVERS
+from tests.worlds.vectors import (
     FORK,
     FORKS,
     MODES,

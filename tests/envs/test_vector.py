@@ -28,24 +28,22 @@ from simenv_marl.errors import (
     ViewError,
     WrongThreadError,
 )
-from tests.extent import examples
-from tests.worlds.counters import (
+from tests.worlds.copied import IDS, Voyage
+from tests.worlds.models import decision, fails, script, stacks
+from tests.worlds.random_worlds import seeds, world_designs
+from tests.worlds.vectors import (
     FORK,
     FORKS,
     MODES,
     POINT,
     VARIETY,
     Counter,
-    Timed,
+    TimedCounter,
     agree,
     definition,
     made,
     same,
 )
-from tests.worlds.many_registered import IDS, Voyage
-from tests.worlds.models import decision, script, stacks
-from tests.worlds.undone import fails
-from tests.worlds.worlds import designs, seeds
 
 pytestmark = FORKS
 PROCESSES = pytest.mark.parametrize("processes", [0, 2])
@@ -57,7 +55,7 @@ PROCESSES = pytest.mark.parametrize("processes", [0, 2])
 def test_matches_sync_vector_env(kind, mode, processes):
     model, decision = VARIETY[kind]
     points = {POINT: decision}
-    options = {"discount_rate": 0.1} if model is Timed else {}
+    options = {"discount_rate": 0.1} if model is TimedCounter else {}
     given = {"num_envs": 5, "autoreset_mode": mode, "workers": processes, "context": FORK}
     ours = vector_env(model, points, **given, **options)
     theirs = SyncVectorEnv([lambda: single_env(model, points, **options)] * 5, autoreset_mode=mode)
@@ -80,7 +78,11 @@ def test_matches_sync_vector_env(kind, mode, processes):
 
 
 @given(
-    designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.sampled_from([*[0] * 9, 1, 3])
+    world_designs(),
+    seeds,
+    st.sampled_from(MODES),
+    st.integers(1, 4),
+    st.sampled_from([*[0] * 9, 1, 3]),
 )
 @examples(150)
 def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number, processes):
@@ -377,7 +379,9 @@ def test_another_thread_needs_the_thread_driver(driver, error):
 def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
     points = {POINT: VARIETY["goal"][1]}
     envs = begun(
-        vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK),
+        vector_env(
+            TimedCounter, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK
+        ),
         3,
     )
     envs.step([1, 2, 3])

@@ -15,12 +15,10 @@ from gymnasium.vector import AsyncVectorEnv
 
 from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
-from tests.conftest import DRIVERS
 from tests.envs.test_vector import begun
 from tests.processes import alone, descriptors, gone, python
-from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
-from tests.worlds.models import notes
-from tests.worlds.undone import fails
+from tests.worlds.models import DRIVERS, fails, notes
+from tests.worlds.vectors import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 
 pytestmark = FORKS
 
@@ -252,7 +250,7 @@ def test_an_interrupted_step_leaves_the_workers_usable():
 SCRIPT = """
 import os
 from simenv_marl import vector_env
-from tests.worlds.counters import Counter
+from tests.worlds.vectors import Counter
 
 class Model(Counter):
     def run(self):

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 
-from tests.worlds.counters import alike
-from tests.worlds.dials import DialEnv, dial_env
+from tests.worlds.vectors import DialEnv, alike, dial_env
 
 
 class Case(NamedTuple):

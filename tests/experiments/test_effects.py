@@ -11,7 +11,7 @@ from scipy import stats
 from simenv_marl.errors import OptionValueError
 from simenv_marl.experiments import design, effects, run_experiment, sobol_indices
 from tests.worlds.models import Script
-from tests.worlds.shops import POINTS
+from tests.worlds.valued import POINTS
 
 
 def told(table, value, seeds=(1, 2)):

@@ -20,11 +20,9 @@ from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, 
 from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
 from tests.processes import run_code
-from tests.worlds.many_worlds import Colony, Design, colony_points
-from tests.worlds.marks import EVERY_DRIVER
-from tests.worlds.models import play
-from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some
-from tests.worlds.undone import fails
+from tests.worlds.entities import Colony, ColonyDesign, colony_points
+from tests.worlds.models import EVERY_DRIVER, fails, play
+from tests.worlds.valued import NEAR, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -66,7 +64,7 @@ def test_the_frame_has_a_row_for_each_agent_and_one_for_the_team():
             assert set(rows["level"]) == {simulate(Shop, policies, points=POINTS, seed=seed).level}
 
 
-COLONY = Design(initial=3, most=8, ticks=4, overseen="before", truncates=True)
+COLONY = ColonyDesign(initial=3, most=8, ticks=4, overseen="before", truncates=True)
 
 
 def by_number(observation):

@@ -20,9 +20,9 @@ from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.seats import FallbackPolicy
 from tests.experiments.test_runs import ROOT, lines, visits
 from tests.experiments.test_wrong_numbers import BET, Casino
-from tests.worlds.many_worlds import beings
+from tests.worlds.entities import beings
 from tests.worlds.models import plainly
-from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.valued import POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 KILLS = int(os.environ.get("KEPT_KILLS", "3"))
 """How many times an evaluation is killed. The bar is 200."""
@@ -253,7 +253,7 @@ def test_misnamed_agent_is_an_error_and_its_runs_are_not_stored(workers, tmp_pat
 SCRIPT = """
 import os, sys, time
 from simenv_marl import evaluate
-from tests.worlds.shops import POINTS, Shop, level, some
+from tests.worlds.valued import POINTS, Shop, level, some
 
 class Own(Shop):
     def reset(self, seed):

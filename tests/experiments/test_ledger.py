@@ -18,9 +18,8 @@ from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError
 from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
 from simenv_marl.planning import RolloutPolicy
 from simenv_marl.seats import describe
-from tests.extent import examples
-from tests.worlds.fairs import POINTS, POLICIES, Fair, advised, boldest
 from tests.worlds.models import Script, define
+from tests.worlds.random_worlds import FAIR_POINTS, FAIR_POLICIES, Fair, boldest, fair_policy
 
 COLUMNS = [
     "seed", "number", "agent", "time", "decision", "action", "rule_action", "value",
@@ -82,10 +81,10 @@ def returns_of(simulation, points, policies, seed, **options):
 )
 @examples(WORLDS)
 def test_contributions_add_up_to_the_difference(seed, driver, method, forced, steps):
-    options = {"points": POINTS, "skip_forced": forced, "max_steps": steps, "driver": driver}
-    found = ledger(Fair, POLICIES, seeds=[seed], method=method, **options)
-    made = returns_of(Fair, policies=POLICIES, seed=seed, **options)
-    ruled = returns_of(Fair, policies=dict.fromkeys(POINTS, RULE), seed=seed, **options)
+    options = {"points": FAIR_POINTS, "skip_forced": forced, "max_steps": steps, "driver": driver}
+    found = ledger(Fair, FAIR_POLICIES, seeds=[seed], method=method, **options)
+    made = returns_of(Fair, policies=FAIR_POLICIES, seed=seed, **options)
+    ruled = returns_of(Fair, policies=dict.fromkeys(FAIR_POINTS, RULE), seed=seed, **options)
     assert found.returns[seed] == pytest.approx(made, abs=1e-9)
     assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
     if len(found.frame):
@@ -94,20 +93,24 @@ def test_contributions_add_up_to_the_difference(seed, driver, method, forced, st
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
 def test_ledger_baseline_may_be_any_policies(method):
-    for baseline in (boldest, dict.fromkeys(POINTS, boldest), {"warden_0": boldest}):
-        by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(POINTS, baseline)
-        found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, baseline=baseline, method=method)
-        expected = returns_of(Fair, POINTS, {**dict.fromkeys(POINTS, RULE), **by_point}, 5)
+    for baseline in (boldest, dict.fromkeys(FAIR_POINTS, boldest), {"warden_0": boldest}):
+        by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(FAIR_POINTS, baseline)
+        found = ledger(
+            Fair, FAIR_POLICIES, seeds=[5], points=FAIR_POINTS, baseline=baseline, method=method
+        )
+        expected = returns_of(
+            Fair, FAIR_POINTS, {**dict.fromkeys(FAIR_POINTS, RULE), **by_point}, 5
+        )
         difference = found.returns[5] - expected
         assert found.frame["contribution"].sum() == pytest.approx(difference, abs=1e-9)
 
 
 def test_ledger_takes_turn_and_joint_policies_of_all_agents():
     """The learner of a turn view, and that of a joint view, whose answers are for a round."""
-    roster = {next(iter(POINTS)): [f"stall_{number}" for number in range(6)]}
+    roster = {next(iter(FAIR_POINTS)): [f"stall_{number}" for number in range(6)]}
     turns = turn_policy(
         lambda seen, info: int(info["action_mask"].argmax()),
-        like=turn_env(Fair, POINTS, possible_agents=roster),
+        like=turn_env(Fair, FAIR_POINTS, possible_agents=roster),
     )
     joint = joint_policy(
         lambda seen: dict.fromkeys(seen, seen[WATERER][4:5] / 4), like=joint_env(GreenhouseSim)
@@ -115,7 +118,7 @@ def test_ledger_takes_turn_and_joint_policies_of_all_agents():
     both = {WATERER: RULE, "ventilator_0": RULE}
     short = {"max_steps": 7}
     for simulation, points, rules, policies in (
-        (Fair, POINTS, dict.fromkeys(POINTS, RULE), turns),
+        (Fair, FAIR_POINTS, dict.fromkeys(FAIR_POINTS, RULE), turns),
         (GreenhouseSim, None, both, joint),
     ):
         there = ledger(simulation, policies, seeds=[3], points=points, **short)
@@ -135,20 +138,20 @@ def test_ledger_can_use_a_metric_or_team_reward_in_place_of_rewards():
     def worth(fair):
         return fair.fortune
 
-    found = ledger(Fair, POLICIES, seeds=[1, 2], points=POINTS, metric=worth)
+    found = ledger(Fair, FAIR_POLICIES, seeds=[1, 2], points=FAIR_POINTS, metric=worth)
     for seed in (1, 2):
-        made = worth(simulate(Fair, POLICIES, points=POINTS, seed=seed))
+        made = worth(simulate(Fair, FAIR_POLICIES, points=FAIR_POINTS, seed=seed))
         ruled = worth(simulate(Fair, seed=seed))
         assert found.returns[seed] == made
         own = found.frame[found.frame["seed"] == seed]
         assert own["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
     team = {"team_reward": worth}
-    found = ledger(Fair, POLICIES, seeds=[1], points=POINTS, **team)
-    made = returns_of(Fair, POINTS, POLICIES, 1, **team)
-    ruled = returns_of(Fair, POINTS, {}, 1, **team)
+    found = ledger(Fair, FAIR_POLICIES, seeds=[1], points=FAIR_POINTS, **team)
+    made = returns_of(Fair, FAIR_POINTS, FAIR_POLICIES, 1, **team)
+    ruled = returns_of(Fair, FAIR_POINTS, {}, 1, **team)
     assert found.frame["contribution"].sum() == pytest.approx(made - ruled, abs=1e-9)
     with pytest.raises(OptionValueError, match="metric must return a number"):
-        ledger(Fair, POLICIES, seeds=[1], points=POINTS, metric=lambda fair: "high")
+        ledger(Fair, FAIR_POLICIES, seeds=[1], points=FAIR_POINTS, metric=lambda fair: "high")
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
@@ -190,23 +193,23 @@ def test_ledger_does_not_repeat_warnings_in_its_copies(recwarn):
 
 def test_ledger_returns_match_the_plain_episode():
     for futures in (0, 2):
-        found = ledger(Fair, POLICIES, seeds=[4], points=POINTS, futures=futures)
-        assert found.returns[4] == pytest.approx(returns_of(Fair, POINTS, POLICIES, 4))
+        found = ledger(Fair, FAIR_POLICIES, seeds=[4], points=FAIR_POINTS, futures=futures)
+        assert found.returns[4] == pytest.approx(returns_of(Fair, FAIR_POINTS, FAIR_POLICIES, 4))
 
 
 # -- the rule decides once ------------------------------------------------------------------------
 
 
 def test_ledger_replaces_one_decision_by_the_rule_with_after_policy():
-    found = ledger(Fair, POLICIES, seeds=[5], points=POINTS, after="policy")
+    found = ledger(Fair, FAIR_POLICIES, seeds=[5], points=FAIR_POINTS, after="policy")
     assert len(found.frame) > 4
     for place, value in enumerate(found.frame["value"]):
         counted = iter(range(1000))
 
         def one_by_rule(observation, info, *, place=place, counted=counted):
-            return RULE if next(counted) == place else advised(observation, info)
+            return RULE if next(counted) == place else fair_policy(observation, info)
 
-        expected = returns_of(Fair, POINTS, dict.fromkeys(POINTS, one_by_rule), 5)
+        expected = returns_of(Fair, FAIR_POINTS, dict.fromkeys(FAIR_POINTS, one_by_rule), 5)
         assert value == pytest.approx(expected, abs=1e-9)
     worth = found.returns[5] - found.frame["value"]
     assert found.frame["contribution"].tolist() == worth.tolist()
@@ -244,11 +247,13 @@ def test_ledger_separates_skill_from_luck():
 @given(seed=seeds)
 @examples(4)
 def test_value_skill_and_luck_add_up_to_the_return(seed):
-    found = ledger(Fair, POLICIES, seeds=[seed], points=POINTS, futures=3)
+    found = ledger(Fair, FAIR_POLICIES, seeds=[seed], points=FAIR_POINTS, futures=3)
     if len(found.frame):
         sums = found.frame[["skill", "luck"]].sum().sum()
         assert found.frame["value"][0] + sums == pytest.approx(found.returns[seed], abs=1e-9)
-    once = ledger(Fair, POLICIES, seeds=[seed], points=POINTS, futures=2, after="policy").frame
+    once = ledger(
+        Fair, FAIR_POLICIES, seeds=[seed], points=FAIR_POINTS, futures=2, after="policy"
+    ).frame
     total = once["value"] + once["skill"] + once["luck"]
     assert total.tolist() == pytest.approx([found.returns[seed]] * len(once))
 
@@ -321,10 +326,10 @@ def test_without_a_decision_the_frame_is_empty():
 
 
 def test_a_sample_has_some_of_the_decisions():
-    given = {"seeds": range(4), "points": POINTS, "futures": 2, "method": "replay"}
-    whole = ledger(Fair, POLICIES, **given).frame
-    some = ledger(Fair, POLICIES, **given, sample=0.3).frame
-    again = ledger(Fair, POLICIES, **given, sample=0.3).frame
+    given = {"seeds": range(4), "points": FAIR_POINTS, "futures": 2, "method": "replay"}
+    whole = ledger(Fair, FAIR_POLICIES, **given).frame
+    some = ledger(Fair, FAIR_POLICIES, **given, sample=0.3).frame
+    again = ledger(Fair, FAIR_POLICIES, **given, sample=0.3).frame
     assert 0 < len(some) < len(whole)
     assert some.equals(again)
     both = some.merge(whole, on=["seed", "number"], suffixes=("", "_whole"))
@@ -334,7 +339,7 @@ def test_a_sample_has_some_of_the_decisions():
 
 
 def test_the_plot_marks_ten_decisions():
-    found = ledger(Fair, POLICIES, seeds=range(3), points=POINTS)
+    found = ledger(Fair, FAIR_POLICIES, seeds=range(3), points=FAIR_POINTS)
     axes = found.plot().axes[0]
     words = [text.get_text() for text in axes.get_legend().get_texts()]
     assert len(words) == min(10, len(found.frame))
@@ -342,7 +347,7 @@ def test_the_plot_marks_ten_decisions():
     assert axes.lines[1].get_ydata()[-1] == pytest.approx(last)
     biggest = found.frame["contribution"].abs().idxmax()
     assert words[0].startswith("{agent}: {decision}".format(**found.frame.loc[biggest]))
-    assert ledger(Fair, POLICIES, seeds=[1], points=POINTS, after="policy").plot().axes
+    assert ledger(Fair, FAIR_POLICIES, seeds=[1], points=FAIR_POINTS, after="policy").plot().axes
     nothing = Script(lambda simulation: None)
     assert ledger(nothing, {"player_0": boldest}, seeds=[1], points=dice()).plot().axes
 
@@ -409,12 +414,12 @@ def test_each_legal_action_has_a_value():
 
 def test_masked_actions_have_no_row_and_policies_play():
     warden = {"warden_0": boldest}
-    found = decision_values(Fair, warden, seeds=[1, 3], points=POINTS, futures=2)
+    found = decision_values(Fair, warden, seeds=[1, 3], points=FAIR_POINTS, futures=2)
     assert set(found["agent"]) == {"warden_0"}
-    chosen = ledger(Fair, warden, seeds=[1, 3], points=POINTS).frame
+    chosen = ledger(Fair, warden, seeds=[1, 3], points=FAIR_POINTS).frame
     last = found.groupby(["seed", "number"])["action"].max()
     assert last.tolist() == chosen["action"].tolist()
-    exact = decision_values(Fair, warden, seeds=[1, 3], points=POINTS, futures=0)
+    exact = decision_values(Fair, warden, seeds=[1, 3], points=FAIR_POINTS, futures=0)
     assert exact["error"].tolist() == [0.0] * len(exact)
 
 

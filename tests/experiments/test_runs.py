@@ -24,9 +24,9 @@ from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.plugins import ChangedResult
 from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import BOTH, command
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.entities import Being, beings
 from tests.worlds.models import Script
-from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.valued import POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame(
     {"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]}
@@ -95,8 +95,8 @@ def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_pa
     )
     provenance = line["provenance"]
     assert provenance["seed"] == 2
-    assert provenance["simulation"] == "tests.worlds.shops.Shop"
-    assert provenance["policies"] == {"keeper": "tests.worlds.shops.some"}
+    assert provenance["simulation"] == "tests.worlds.valued.Shop"
+    assert provenance["policies"] == {"keeper": "tests.worlds.valued.some"}
     assert "numpy" in provenance["dependencies"]
 
 
@@ -183,7 +183,7 @@ def test_points_and_plugins_may_be_iterators(tmp_path):
         points = POINTS
 
     plugins = [
-        (lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.shops.Shop.sell", "after")
+        (lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.valued.Shop.sell", "after")
     ]
     points, given = [Shop.order], {"make": Own, "contenders": {"much": {"keeper": much}}}
     expected = run(tmp_path / "a", points=points, plugins=plugins, **given)
@@ -347,13 +347,13 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
     [
         (r'options {} then, {"max_steps": 2} now', {"max_steps": 2}),
         (
-            r"'much' .*policies .*shops.much.* then, .*shops.some",
+            r"'much' .*policies .*valued.much.* then, .*valued.some",
             {"contenders": {"much": {"keeper": some}}},
         ),
         (r"simulation .*Shop.* then, .*Other.* now", {"make": type("Other", (Shop,), {})}),
         (
             r"plugins \[\] then",
-            {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]},
+            {"plugins": [(lambda shop: None, "tests.worlds.valued.Shop.sell", "before")]},
         ),
         (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
     ],
@@ -576,7 +576,7 @@ SCRIPT = """
     sys.path.insert(0, sys.argv[1])
     import pandas as pd
     from simenv_marl.experiments import run_experiment
-    from tests.worlds.shops import POINTS, Shop, level, some
+    from tests.worlds.valued import POINTS, Shop, level, some
 
     class Own(Shop):
         def order(self):

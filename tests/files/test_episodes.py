@@ -32,13 +32,13 @@ from simenv_marl.errors import (
 from simenv_marl.planning import RolloutPolicy
 from tests.processes import python
 from tests.worlds import saved
-from tests.worlds.random_worlds import POINTS, outcome
+from tests.worlds.random_worlds import YARD_POINTS, yard_outcome
 from tests.worlds.saved import Pumps, differing, future, move, steady, yard
 
 YARD = partial(yard, 3, 2, 2, 2, 3, None)
 
 
-def begun(make=aec_env, simulation=YARD, points=POINTS, *, taken=6, seed=7, **options):
+def begun(make=aec_env, simulation=YARD, points=YARD_POINTS, *, taken=6, seed=7, **options):
     """Return an environment after some steps."""
     env = make(simulation, points, **options)
     env.reset(seed=seed)
@@ -70,7 +70,7 @@ def test_a_clone_is_saved_like_its_original(make, method, tmp_path):
     assert (tmp_path / "env").read_text() == (tmp_path / "clone").read_text()
     loaded = load_episode(tmp_path / "clone")
     assert future(loaded, 3) == future(env, 3)
-    assert outcome(loaded.unwrapped.simulation) == outcome(env.unwrapped.simulation)
+    assert yard_outcome(loaded.unwrapped.simulation) == yard_outcome(env.unwrapped.simulation)
 
 
 class Reseeded(Pumps):
@@ -190,7 +190,7 @@ def test_episode_file_is_small(tmp_path):
     ],
 )
 def test_parts_without_a_name_are_refused_or_left_open(options, culprit, tmp_path):
-    env = aec_env(YARD, POINTS, **options)
+    env = aec_env(YARD, YARD_POINTS, **options)
     env.reset(seed=1)
     with pytest.raises(EpisodeFileError, match=f"no dotted name.*{culprit}"):
         save_episode(env, tmp_path / "a")
@@ -202,7 +202,7 @@ def test_parts_without_a_name_are_refused_or_left_open(options, culprit, tmp_pat
 
 
 def test_simulations_and_points_without_a_name_are_given_at_loading(tmp_path):
-    points = {name: POINTS[name] for name in POINTS}
+    points = {name: YARD_POINTS[name] for name in YARD_POINTS}
     made = saved.Yard(saved.Design(3, 2, 2, 2, 3, None))
     env = begun(simulation=made, points=points)
     with pytest.raises(EpisodeFileError, match="the simulation: <"):
@@ -214,7 +214,7 @@ def test_simulations_and_points_without_a_name_are_given_at_loading(tmp_path):
 
 
 def test_a_definition_that_no_module_holds_is_refused(tmp_path):
-    points = {name: saved.define_again() for name in list(POINTS)[:1]}
+    points = {name: saved.define_again() for name in list(YARD_POINTS)[:1]}
     env = begun(points=points, taken=1)
     with pytest.raises(EpisodeFileError, match=r"the definition of .*Yard\.plan"):
         save_episode(env, tmp_path / "a")
@@ -226,7 +226,7 @@ def test_a_definition_that_no_module_holds_is_refused(tmp_path):
 
 def test_save_refuses_environments_without_one_episode_of_their_own(tmp_path):
     with pytest.raises(NotResetError):
-        save_episode(aec_env(YARD, POINTS), tmp_path / "a")
+        save_episode(aec_env(YARD, YARD_POINTS), tmp_path / "a")
     env = vector_env(Pumps, num_envs=1)
     with pytest.raises(ViewError, match="one simulation"):
         save_episode(env, tmp_path / "a")
@@ -440,10 +440,10 @@ def test_vector_environments_record_each_simulation(tmp_path):
 
 def test_parts_without_a_name_are_refused_at_construction(tmp_path):
     with pytest.raises(EpisodeFileError, match="no dotted name"):
-        aec_env(lambda: YARD(), POINTS, record=tmp_path / "never")
+        aec_env(lambda: YARD(), YARD_POINTS, record=tmp_path / "never")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OptionValueError, match="record must be a folder"):
-        aec_env(YARD, POINTS, record=3)
+        aec_env(YARD, YARD_POINTS, record=3)
 
 
 def test_record_file_after_a_kill_can_be_loaded_and_continued(tmp_path):
@@ -513,7 +513,7 @@ def test_save_is_refused_while_a_step_or_reset_runs(tmp_path):
         found.append(1)
         return 1
 
-    env = aec_env(YARD, POINTS, policies={"planner": use})
+    env = aec_env(YARD, YARD_POINTS, policies={"planner": use})
     env.reset(seed=1)
     assert found
 

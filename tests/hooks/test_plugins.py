@@ -47,13 +47,14 @@ from tests.worlds.models import (
     decision,
     decisions,
     define,
+    fails,
+    left_as_they_were,
     notes,
     plainly,
     play,
     script,
     step,
 )
-from tests.worlds.undone import fails, left_as_they_were
 
 HERE = __name__
 

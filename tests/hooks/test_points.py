@@ -28,8 +28,17 @@ from simenv_marl.plugins import handlers
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import begun, calling, decision, decisions, define, plainly, play, script
-from tests.worlds.undone import left_as_they_were
+from tests.worlds.models import (
+    begun,
+    calling,
+    decision,
+    decisions,
+    define,
+    left_as_they_were,
+    plainly,
+    play,
+    script,
+)
 
 # Traders and brokers decide under one name here: it is about functions, and not about agents.
 pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")

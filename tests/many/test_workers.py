@@ -23,12 +23,11 @@ from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.contract.test_simulate_many import ones
 from tests.processes import ROOT, alone, descriptors, python
-from tests.worlds import shops
-from tests.worlds.counters import same
-from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.models import calling, decision, define, script
-from tests.worlds.shops import Shop
-from tests.worlds.undone import fails
+from tests.worlds import valued
+from tests.worlds.entities import Colony, ColonyDesign, Creature, colony_points
+from tests.worlds.models import calling, decision, define, fails, script
+from tests.worlds.valued import Shop
+from tests.worlds.vectors import same
 
 # Where work is given up, joblib empties its queue of work while a thread of its own may be about to
 # take from it, and ends that thread in any case.
@@ -36,7 +35,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:Exception in thread ExecutorManagerThread:pytest.PytestUnhandledThreadExceptionWarning"
 )
 
-DESIGN = Design(initial=4, most=12, ticks=4, overseen="before", truncates=True)
+DESIGN = ColonyDesign(initial=4, most=12, ticks=4, overseen="before", truncates=True)
 POINTS = colony_points(overseen=True)
 
 
@@ -415,7 +414,7 @@ def test_progress_bar_moves_with_each_episode_of_a_worker(backend, capsys):
         return 5
 
     shop = partial(Shop, kind="slow")
-    given = {"seeds": range(60), "points": shops.POINTS, "workers": 2, "progress": True}
+    given = {"seeds": range(60), "points": valued.POINTS, "workers": 2, "progress": True}
     with joblib.parallel_config(backend=backend):
         collect_episodes(shop, {"keeper": asked}, **given)
     numbers = list(map(int, re.findall(r" (\d+)/60 \[", capsys.readouterr().err)))
@@ -487,7 +486,7 @@ def test_lost_runs_are_run_again_once_each_alone(batch_size, tmp_path):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 def test_lost_episodes_are_left_out_of_trajectories(tmp_path):
-    given = {"points": shops.POINTS, "collect": seed_of, "batch_size": 2}
+    given = {"points": valued.POINTS, "collect": seed_of, "batch_size": 2}
     model, policies = doomed(tmp_path, always=(2, 9), once=(4,)), {"keeper": ones}
     found = collect_episodes(model, policies, seeds=range(12), workers=2, **given)["keeper"]
     seeds = [seed for seed in range(12) if seed not in (2, 9)]

@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from simenv_marl import SimulationInterface, difference, make_step
 from simenv_marl.remote import ProcessSimulation
-from tests.worlds import faulty, outside
+from tests.worlds import outside
 from tests.worlds.models import play
 
 
@@ -54,7 +54,7 @@ def reservoirs(points=BOTH, **options):
 
 def broken(what):
     """A simulator that does something wrong in mid-episode."""
-    return ProcessSimulation([sys.executable, faulty.__file__, what], BOTH, timeout=20.0)
+    return ProcessSimulation(command("faulty", what), BOTH, timeout=20.0)
 
 
 CHANGED = """

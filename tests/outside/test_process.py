@@ -50,7 +50,7 @@ from tests.outside.reservoirs import (
     reservoirs,
 )
 from tests.processes import runs
-from tests.worlds import bare
+from tests.worlds import outside
 from tests.worlds.models import begun, play
 
 
@@ -179,12 +179,12 @@ PLAIN = make_step(
 
 
 @pytest.mark.parametrize(
-    "name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.bare.main"]
+    "name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.outside.main"]
 )
 def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
     before, seen = json.dumps, []
     # sends as little as it may
-    simulation = ProcessSimulation([sys.executable, bare.__file__, name], {name: PLAIN})
+    simulation = ProcessSimulation([sys.executable, outside.__file__, "bare", name], {name: PLAIN})
     env = make_env(
         aec_env, simulation, name, plugins=[(lambda call: seen.append(call.point), name, "before")]
     )
@@ -231,7 +231,7 @@ def test_other_futures_are_drawn_in_the_process(make_env):
 
 def test_process_that_cannot_reseed_raises_an_error():
     simulation = begun(
-        ProcessSimulation([sys.executable, bare.__file__, "rate"], {"rate": PLAIN}), 1
+        ProcessSimulation([sys.executable, outside.__file__, "bare", "rate"], {"rate": PLAIN}), 1
     )
     with pytest.raises(BranchError, match='has not announced "reseed"'):
         simulation.reseed(3)

@@ -14,8 +14,8 @@ from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, Wi
 from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, command, reservoirs
 from tests.processes import runs
-from tests.worlds.counters import alike
 from tests.worlds.models import begun, play
+from tests.worlds.vectors import alike
 
 pytestmark = pytest.mark.greenlet(
     "the rule's decision comes back within the simulation, whatever runs it"

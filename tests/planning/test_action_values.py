@@ -45,10 +45,9 @@ from simenv_marl.errors import (
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.players import player_of
 from simenv_marl.planning.rollouts import Rollouts
-from tests.conftest import DRIVERS
 from tests.test_branch import METHODS
-from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
-from tests.worlds.models import define
+from tests.worlds.models import DRIVERS, define
+from tests.worlds.valued import LEFT, Duel, Unseeded, points, worth
 
 VIEWS = ("aec", "parallel", "single", "agent")
 

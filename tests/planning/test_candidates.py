@@ -20,10 +20,9 @@ from simenv_marl import (
 )
 from simenv_marl.errors import InvalidActionError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, first
-from tests.conftest import DRIVERS
 from tests.planning.test_action_values import begun
 from tests.test_branch import METHODS
-from tests.worlds.models import define
+from tests.worlds.models import DRIVERS, define
 
 
 class Works:

@@ -29,11 +29,10 @@ from simenv_marl import (
 from simenv_marl.data import collect_episodes, compare_with_rule
 from simenv_marl.errors import ClosedError, CopyError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
-from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
 from tests.test_branch import METHODS
-from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
-from tests.worlds.models import define, step
+from tests.worlds.models import DRIVERS, define, step
+from tests.worlds.valued import LEFT, Duel, Unseeded, points, worth
 
 
 def planner(**given):

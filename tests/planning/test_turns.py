@@ -12,9 +12,9 @@ from simenv_marl.data import joint_policy, turn_policy
 from simenv_marl.errors import InvalidActionError, OptionValueError, UnknownAgentError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
 from tests.planning.test_action_values import METHODS, begun, futures_of
-from tests.worlds import random_worlds as yards
-from tests.worlds.duels import Duel, Unseeded, points
+from tests.worlds import random_worlds
 from tests.worlds.models import calling, decision
+from tests.worlds.valued import Duel, Unseeded, points
 
 ONE_FUTURE = pytest.mark.filterwarnings("ignore:.*cannot draw new random numbers")
 
@@ -66,13 +66,13 @@ def test_values_match_clones_that_are_stepped_by_hand(base, given, method):
 
 @pytest.mark.parametrize("flatten", [False, True])
 def test_values_with_births_and_deaths_match_stepping_by_hand(flatten):
-    class Yard(yards.Yard):
+    class Yard(random_worlds.Yard):
         def reseed(self, seed):
             self.random.seed(seed)
 
-    design = yards.Design(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
-    options = {"possible_agents": yards.ROSTER, "flatten": flatten}
-    env = begun(turn_env(lambda: Yard(design), yards.POINTS, **options))
+    design = random_worlds.YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
+    options = {"possible_agents": random_worlds.YARD_ROSTER, "flatten": flatten}
+    env = begun(turn_env(lambda: Yard(design), random_worlds.YARD_POINTS, **options))
     actions = [RULE, *range(env.action_space.n)]
     for _ in range(3):
         told = action_values(env, actions, futures=2)

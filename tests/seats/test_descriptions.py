@@ -20,8 +20,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.seats import describe, parse
-
-from .tank import FILL, POINTS, Tank, filling, played
+from tests.worlds.seats import FILL, POINTS, Tank, filling, played
 
 
 def env_of(definition=FILL):
@@ -52,7 +51,7 @@ def test_pending_decision_is_described_as_json():
     found = describe(env_of(), as_json=True)
     assert json.loads(json.dumps(found)) == {
         "agent": "filler",
-        "point": "tests.seats.tank.Tank.fill",
+        "point": "tests.worlds.seats.Tank.fill",
         "number": 1,
         "time": 0.0,
         "question": "By its rule: Choose how much water flows in.",

@@ -12,8 +12,7 @@ from simenv_marl import aec_env, load_episode, save_episode, turn_env
 from simenv_marl.errors import InvalidActionError, OptionValueError, ViewError
 from simenv_marl.seats import RecordedPolicy, describe, free_text, parse
 from simenv_marl.testing import check_simulation
-
-from .tank import DRAIN, FILL, Tank, filling, played
+from tests.worlds.seats import DRAIN, FILL, Tank, filling, played
 
 SAID = 'Größer 大 "quotes" \n{x: 1} \N{GRINNING FACE}'
 

@@ -21,9 +21,9 @@ from simenv_marl.errors import (
     OptionValueError,
 )
 from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, describe
+from tests.worlds.seats import FILL, Tank, filling, levels, played
 
 from .endpoint import endpoint, fails, says
-from .tank import FILL, Tank, filling, levels, played
 
 openai = pytest.importorskip("openai")
 

@@ -8,8 +8,7 @@ import pytest
 from simenv_marl import aec_env, simulate
 from simenv_marl.errors import DefinitionError, NoDecisionError
 from simenv_marl.testing import check_simulation
-
-from .tank import FILL, POINTS, Tank
+from tests.worlds.seats import FILL, POINTS, Tank
 
 
 def decisions(points, **options):

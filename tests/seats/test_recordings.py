@@ -17,8 +17,7 @@ from simenv_marl.data import collect_episodes
 from simenv_marl.errors import OptionValueError
 from simenv_marl.files.values import digest_of
 from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, RecordedPolicy
-
-from .tank import FILL, POINTS, Tank, filling, levels, played
+from tests.worlds.seats import FILL, POINTS, Tank, filling, levels, played
 
 
 @pytest.fixture

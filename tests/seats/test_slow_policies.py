@@ -18,8 +18,7 @@ from simenv_marl.errors import InvalidActionError, OptionValueError, ReentrancyE
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 from tests.worlds.models import follow_the_rule, stacks
-
-from .tank import FILL, POINTS, Tank, experiment, filling, levels, log_of, played
+from tests.worlds.seats import FILL, POINTS, Tank, experiment, filling, levels, log_of, played
 
 
 def quick(observation):

@@ -12,8 +12,7 @@ import pytest
 from simenv_marl import RULE, branch, clone, evaluate, single_env
 from simenv_marl.errors import DefinitionError, InvalidActionError, OptionValueError
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
-
-from .tank import FILL, POINTS, Tank, experiment, levels, played
+from tests.worlds.seats import FILL, POINTS, Tank, experiment, levels, played
 
 
 def counted(**numbers):

@@ -4,15 +4,22 @@ import threading
 
 from simenv_marl.testing import check_simulation
 from tests.processes import python
-from tests.worlds import sets
+from tests.worlds.copied import (
+    HashedWalk,
+    NamedWalk,
+    NotedWalk,
+    OrderedWalk,
+    UnorderedWalk,
+    walk_points,
+)
 
 
 def checked(simulation, **changes):
-    return check_simulation(simulation, sets.points(simulation, **changes), episodes=2, seeds=[4])
+    return check_simulation(simulation, walk_points(simulation, **changes), episodes=2, seeds=[4])
 
 
 def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
-    for model in (sets.Unordered, sets.Noted, sets.Hashed):
+    for model in (UnorderedWalk, NotedWalk, HashedWalk):
         (seen,) = checked(model).of("error")
         assert seen.title.endswith("not give the same run in another process")
         assert "Sort the set" in seen.explanation
@@ -20,14 +27,14 @@ def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
 
 
 def test_check_accepts_sorted_sets():
-    report = checked(sets.Ordered)
+    report = checked(OrderedWalk)
     assert not report.of("error")
     assert any("six hash seeds" in line for line in report.checked)
 
 
 def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
     lock = threading.Lock()
-    report = checked(sets.Walk, reward_mapping=lambda walk: walk.place + lock.locked())
+    report = checked(NamedWalk, reward_mapping=lambda walk: walk.place + lock.locked())
     assert report.ok
     assert "new processes with six hash seeds, because TypeError: cannot pickle" in str(
         report.checked
@@ -37,9 +44,10 @@ def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
 def test_a_script_without_a_main_guard_can_be_checked(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from tests.testing.test_processes import checked, sets\n"
-        "class Unordered(sets.Walk):\n"
-        "    names = {*sets.NAMES}\n"
+        "from tests.testing.test_processes import checked\n"
+        "from tests.worlds.copied import NAMES, NamedWalk\n"
+        "class Unordered(NamedWalk):\n"
+        "    names = {*NAMES}\n"
         "print(checked(Unordered))\n"
     )
     done = python(script)

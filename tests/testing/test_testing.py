@@ -30,8 +30,9 @@ from simenv_marl.testing import CheckReport, Finding, check_simulation, inspect_
 from simenv_marl.testing.fingerprint import MOST_PARTS, differences, fingerprint
 from simenv_marl.testing.report import order_of
 from tests.contract.test_mesa import Meadow, herd
-from tests.worlds import many_worlds, worlds
+from tests.worlds import entities
 from tests.worlds.models import define, script
+from tests.worlds.random_worlds import KINDS, World, WorldDesign, points_of
 
 BOX = spaces.Box(-100, 100, (2,), np.float32)
 
@@ -107,22 +108,22 @@ def test_check_of_a_sound_simulation_finds_nothing():
 
 
 def test_check_finds_nothing_in_sound_points_of_all_kinds():
-    design = worlds.Design(worlds.KINDS, tuple((number % 9, number % 3) for number in range(27)))
-    functions = worlds.points_of(design)
-    report = clean(check_simulation(lambda: worlds.World(design, functions), functions, episodes=4))
+    design = WorldDesign(KINDS, tuple((number % 9, number % 3) for number in range(27)))
+    functions = points_of(design)
+    report = clean(check_simulation(lambda: World(design, functions), functions, episodes=4))
     methods = [part for part in report.statistics if part.point == report.statistics[0].point]
     assert [part.agents for part in methods] == ["point_0", "point_5", "point_7", "point_8"]
     assert methods[0].decisions == methods[1].decisions == 12
 
 
-COLONY = many_worlds.Design(initial=4, most=10, ticks=6, overseen="before")
+COLONY = entities.ColonyDesign(initial=4, most=10, ticks=6, overseen="before")
 
 
 @pytest.mark.parametrize(
     ("simulation", "points"),
     [
         (GreenhouseSim, None),
-        (lambda: many_worlds.Announcing(COLONY), many_worlds.colony_points(overseen=True)),
+        (lambda: entities.AnnouncingColony(COLONY), entities.colony_points(overseen=True)),
         (Meadow, herd()),
     ],
     ids=["greenhouse", "colony", "meadow"],
@@ -155,14 +156,14 @@ def in_one_generator(seed):
 def test_check_notes_entities_that_share_generators(generators, noted):
     def main(simulation):
         simulation.beings, simulation.generators = (
-            list(map(many_worlds.Being, range(3))),
+            list(map(entities.Being, range(3))),
             generators(simulation.seed),
         )
         for being in simulation.beings:
             being.act()
             being.health += simulation.generators[str(being.number)].random()
 
-    report = check_simulation(script(main), many_worlds.beings(removed_by=()), episodes=2)
+    report = check_simulation(script(main), entities.beings(removed_by=()), episodes=2)
     found = [finding for finding in report.findings if "share random generators" in finding.title]
     assert [(finding.severity, finding.evidence) for finding in found] == [
         ("note", text) for text in noted

@@ -1,18 +1,28 @@
-"""What the tests share: definitions, simulations and players."""
+"""Small models of a line or two, and what most tests need around them.
+
+``calling``, ``script`` and ``decision`` make a model inside a test; ``define`` makes a definition.
+``play``, ``step`` and ``follow_the_rule`` play an environment, in any view. ``EVERY_VIEW`` and
+``EVERY_DRIVER`` repeat a test. Context managers expect an error or put registries back.
+"""
 
 import gc
 import re
+import sys
 from collections.abc import Mapping
+from contextlib import contextmanager
 from time import sleep
 from typing import Any, NamedTuple
 from weakref import WeakSet
 
 import greenlet
+import gymnasium
 import numpy as np
+import pettingzoo
+import pytest
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from simenv_marl import RULE, make_step
+from simenv_marl import RULE, aec_env, joint_env, make_step, parallel_env, single_env
 
 
 def plainly(value):
@@ -221,3 +231,81 @@ _unattended = decision()
 def nobody_is_asked():
     """Whether no simulation counts as running in this thread: decision functions are rules."""
     return bool(_unattended() == "rule")
+
+
+VIEWS = (aec_env, parallel_env, joint_env, single_env)
+EVERY_VIEW = pytest.mark.parametrize("view", VIEWS)
+
+DRIVERS = ("greenlet", "thread")
+EVERY_DRIVER = pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
+"""Environments are made with that driver, unless they are told otherwise."""
+
+
+MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
+"""The modules that pages of the documentation import from the folder they are in."""
+
+
+@contextmanager
+def registries_put_back():
+    """Put back what Gymnasium's and PettingZoo's registries held."""
+    names = ("aec_registry", "parallel_registry")  # older releases have none
+    registries = (
+        gymnasium.registry,
+        *(getattr(pettingzoo, name) for name in names if hasattr(pettingzoo, name)),
+    )
+    before = [dict(registry) for registry in registries]
+    try:
+        yield
+    finally:
+        for registry, entries in zip(registries, before, strict=True):
+            registry.clear()
+            registry.update(entries)
+
+
+@contextmanager
+def models_of_pages_forgotten():
+    """Have the models of pages imported anew, and forget them afterwards.
+
+    Names of decision points would find the decorated functions of an earlier import as long as
+    these exist.
+    """
+    _forget_models_of_pages()
+    try:
+        yield
+    finally:
+        _forget_models_of_pages()
+
+
+def _forget_models_of_pages():
+    for model in MODELS_OF_PAGES:
+        sys.modules.pop(model, None)
+    gc.collect()
+
+
+@contextmanager
+def left_as_they_were(*places):
+    """Make sure that classes and modules hold at the end just what they held."""
+    before = [held(place) for place in places]
+    yield
+    for place, then in zip(places, before, strict=True):
+        now = held(place)
+        assert now.keys() == then.keys()
+        assert all(now[name] is then[name] for name in now)
+
+
+def held(place):
+    """What a class or module holds, but for what Python adds."""
+    return {
+        name: value
+        for name, value in vars(place).items()
+        if not name.startswith("__") or name == "__init__"
+    }
+
+
+@contextmanager
+def fails(error, *words, match=None):
+    """Expect an error whose notes have all of these words."""
+    with pytest.raises(error, match=match) as caught:
+        yield caught
+    for word in words:
+        assert word in notes(caught.value)

@@ -1,16 +1,22 @@
-"""A process of its own that speaks the wire: reservoirs are filled, leak, are given up, and return.
+"""Models outside Python: simulators in processes of their own, which speak the wire.
 
-``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its
-rule decides. ``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and
-nothing of the library, as a simulator in another language would not have it. The tests run the same
-model in their own process, too.
+``python outside.py [EPISODES] [tells]`` plays reservoirs, which are filled, leak, are given up and
+return, to an environment; with ``tells`` it says what its rule decides. ``python outside.py SEED``
+plays them by their own rule. ``python outside.py bare POINT ...`` sends only required frames.
+``python outside.py faulty WHAT`` does something wrong in mid-episode, one of ``FAULTS``.
+
+This file needs nothing but Python, as a simulator in another language would. ``tests/outside``
+has the same model in the process of the tests.
 """
 
 import json
 import os
 import random
+import subprocess
 import sys
+import time
 from math import inf
+from typing import Any
 
 
 class Stopped(BaseException):
@@ -162,10 +168,100 @@ class Wire:
 POINTS = ["reservoir.inflow", "broker.price"]
 
 
+def _grandchild(wire):
+    """Leave behind what holds the pipes, and go."""
+    subprocess.Popen(["sleep", "600"], pass_fds=(wire.writing, wire.lines.fileno()))
+    os._exit(5)
+
+
+def _close(wire):
+    os.close(wire.writing)
+    time.sleep(600)
+
+
+def _flood(wire):
+    os.write(2, b"a last word\n")
+    os.abort()
+
+
+UPDATE = {"update": "a", "point": "reservoir.inflow", "args": {}}
+
+FAULTS = {
+    "garbage": lambda wire: wire.raw(b"hello?\n"),
+    "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
+    "drop by drop": lambda wire: [(wire.raw(b"{"), time.sleep(0.05)) for _ in range(12_000)],
+    "silence": lambda wire: time.sleep(600),
+    "exit": lambda wire: os._exit(3),
+    "crash": _flood,
+    "closed": _close,
+    "grandchild": _grandchild,
+    "updates": lambda wire: [wire.send(UPDATE) for _ in range(10**6)],
+    "slow updates": lambda wire: [(wire.send(UPDATE), time.sleep(0.01)) for _ in range(60_000)],
+    "gigabyte": lambda wire: [wire.raw(bytes(1 << 20)) for _ in range(1 << 10)],
+    "error": lambda wire: wire.send(
+        {"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}
+    ),
+}
+"""What goes wrong in mid-episode, after three decisions."""
+
+
+class Faulty:
+    """A model that does it."""
+
+    wire: Any
+    what: str
+
+    def __init__(self, seed, options):
+        self.options = options
+
+    def run(self, decide, *_):
+        """Decide three times, then do it."""
+        try:
+            for _ in range(3):
+                decide(
+                    "reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0
+                )
+        except Stopped:
+            if self.what == "end after stop":
+                self.wire.send({"end": {}})
+            raise
+        if not self.options.get("well"):
+            FAULTS[self.what](self.wire)
+            self.wire.receive()
+
+    def result(self):
+        """Nothing came of it."""
+
+
+def bare(*points):
+    """Play episodes of six decisions: each third one at the last point, others at the first."""
+    reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+    with open(reading) as lines, open(writing, "w", buffering=1) as out:
+        out.write(json.dumps({"hello": 1, "points": points, "written in": "Python"}) + "\n")
+        for _ in lines:
+            values = []
+            for number in range(1, 7):
+                point = points[-1 if number % 3 == 0 else 0]
+                out.write(json.dumps({"decide": number, "point": point, "aside": [number]}) + "\n")
+                answer = json.loads(next(lines))
+                if "stop" in answer:
+                    break
+                values.append(answer.get("value"))
+            else:
+                out.write(json.dumps({"end": {"result": values}}) + "\n")
+
+
 def main():
     """Play to an environment, or by the model's rule, with the result on the standard output."""
+    kind, *words = sys.argv[1:] or [None]
     numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
-    if "SIMENV_MARL_FDS" in os.environ:
+    if kind == "bare":
+        bare(*words)
+    elif kind == "faulty":
+        Faulty.wire, Faulty.what = Wire(), *words
+        print("there are many words", file=sys.stderr)
+        Faulty.wire.play(Faulty, POINTS)
+    elif "SIMENV_MARL_FDS" in os.environ:
         Wire().play(Reservoirs, POINTS, *numbers)
     else:
         print(json.dumps(Reservoirs(numbers[0], {}).by_its_rule()))

@@ -1,11 +1,18 @@
-"""Random worlds whose episodes are saved after some decisions, and continued in another process.
+"""Episodes in mid-course, and commands that compare thousands of their continuations.
 
-Run with ``python -m tests.worlds.saved 10000``: it prints how many continuations differ.
+``cases`` draws environments that can be saved: ``Depot`` (one call decides for many), ``Pumps``
+(vectors as actions), yards and worlds. ``Archive`` has open files and global generators, for forks.
+
+``python -m tests.worlds.saved 10000`` saves episodes and continues them in another process;
+``python -m tests.worlds.saved 10000 branches`` does so with branches and clones. Both print how
+many differ from their original: there are to be none.
 """
 
 import json
+import os
 import pickle
 import random
+import shutil
 import sys
 import tempfile
 import warnings
@@ -21,6 +28,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from simenv_marl import (
     RULE,
     aec_env,
+    branch,
     clone,
     joint_env,
     load_episode,
@@ -33,16 +41,26 @@ from simenv_marl import (
 from simenv_marl.core import EpisodeState
 from tests.processes import python
 from tests.worlds import random_worlds
-from tests.worlds.random_worlds import POINTS, Design, Yard
-from tests.worlds.worlds import KINDS, World, advised, points_of
-from tests.worlds.worlds import Design as Program
+from tests.worlds.copied import move as move_trip
+from tests.worlds.models import decision
+from tests.worlds.random_worlds import (
+    KINDS,
+    YARD_POINTS,
+    World,
+    Yard,
+    YardDesign,
+    points_of,
+    world_policy,
+    yard_outcome,
+)
+from tests.worlds.random_worlds import WorldDesign as Program
 
 HERE = __name__
 
 
 def yard(machines, jobs, cranes, plans, luck, until):
     """Make a yard, from arguments that a file has."""
-    return Yard(Design(machines, jobs, cranes, plans, luck, until))
+    return Yard(YardDesign(machines, jobs, cranes, plans, luck, until))
 
 
 class Depot:
@@ -145,7 +163,7 @@ def pushing(observation, info):
 
 def define_again():
     """Return a definition that no module holds."""
-    plan = POINTS[f"{random_worlds.HERE}.Yard.plan"]
+    plan = YARD_POINTS[f"{random_worlds.HERE}.Yard.plan"]
     return replace(plan, agent="planner")
 
 
@@ -180,16 +198,16 @@ def cases(chance):
                 (parallel_env, {}),
                 (turn_env, {}),
                 (turn_env, {"flatten": True}),
-                (joint_env, {"possible_agents": random_worlds.ROSTER}),
+                (joint_env, {"possible_agents": random_worlds.YARD_ROSTER}),
                 (single_env, {"agent": "planner"}),
                 (
                     aec_env,
-                    {"policies": {f"{random_worlds.HERE}.Machine.load": random_worlds.advised}},
+                    {"policies": {f"{random_worlds.HERE}.Machine.load": random_worlds.yard_policy}},
                 ),
-                (parallel_env, {"policies": {"planner": random_worlds.advised}}),
+                (parallel_env, {"policies": {"planner": random_worlds.yard_policy}}),
             ]
         )
-        return Case(make, (partial(yard, *numbers), POINTS), {"driver": driver, **options})
+        return Case(make, (partial(yard, *numbers), YARD_POINTS), {"driver": driver, **options})
     if kind == "depot":
         make, options = chance.choice(
             [
@@ -228,7 +246,7 @@ def program(seed):
         policies=frozenset({1} if number > 2 else ()),
     )
     points = points_of(design)
-    policies = {points[point]: advised for point in design.policies}
+    policies = {points[point]: world_policy for point in design.policies}
     return {
         "simulation": partial(World, design, points),
         "points": points,
@@ -329,11 +347,202 @@ def differing(number, first=0):
     return [seed for seed in expected if found[seed] != expected[seed]]
 
 
-if __name__ == "__main__":
-    warnings.simplefilter("ignore")
-    from tests.worlds.saved import differing as differ_of  # its functions are of a module then
+choose = decision()
 
-    of, differ = int(sys.argv[1]), []
-    for first in range(0, of, 200):
-        differ += differ_of(min(200, of - first), first)
-    print(f"{len(differ)} of {of:,} differ {differ[:20]}", flush=True)
+
+class Archive:
+    """Does something random with a file between decisions; its log holds all that it reads."""
+
+    def __init__(self, days=12):
+        self.days = days
+
+    def reset(self, seed=None):
+        self.seed, self.log = seed, []
+        self.chance = random.Random(seed)
+        random.seed(seed)
+        np.random.seed(seed)
+        self.files = []
+        self.numbers = []
+        self.folder = tempfile.mkdtemp()
+
+    def close(self):
+        """Branches do not come here, and so leave the folder to the environment."""
+        shutil.rmtree(self.folder)
+
+    def run(self):
+        with tempfile.NamedTemporaryFile("w+", dir=self.folder, delete=False) as self.named:
+            Path(self.folder, "0").write_text(
+                "".join(f"{line} " * 3 + "\n" for line in range(3000))
+            )
+            try:
+                # what is found by its name is every branch's alike
+                for _ in range(self.chance.randrange(6)):
+                    self.open()
+                self.numbers.append(os.open(Path(self.folder, "0"), os.O_RDWR))
+                for day in range(self.days):
+                    self.log.append(
+                        (day, choose(), random.random(), random.gauss(0, 1), np.random.random())
+                    )
+                    for _ in range(self.chance.randrange(4)):
+                        self.chance.choice(DEEDS)(self)
+                self.look()
+            finally:
+                while self.files:
+                    self.files.pop().close()
+                while self.numbers:
+                    os.close(self.numbers.pop())
+
+    def open(self):
+        path = Path(self.folder, str(self.chance.randrange(3)))
+        mode = self.chance.choice(["r+", "a+", "w+", "a", "r"])
+        self.files.append(open(path, mode if path.exists() else "w+"))  # noqa: SIM115 - closed later
+
+    def open_nameless(self):
+        self.files.append(tempfile.TemporaryFile("w+"))  # noqa: SIM115
+
+    def write(self):
+        file = self.any_file()
+        if file.writable():
+            file.write(f"{self.log[-1]}\n" * self.chance.randrange(1, 400))
+        if self.chance.random() < 0.5:
+            file.flush()
+
+    def read(self):
+        file = self.any_file()
+        if file.readable():
+            self.log.append((file.read(self.chance.randrange(9000)), file.tell()))
+
+    def seek(self):
+        file = self.any_file()
+        file.seek(0 if self.chance.random() < 0.5 else self.chance.randrange(2000))
+
+    def duplicate(self):
+        self.numbers.append(os.dup(self.chance.choice(self.numbers)))
+
+    def use_numbers(self):
+        for number in self.numbers:
+            self.log.append(os.read(number, self.chance.randrange(50)))
+            if self.chance.random() < 0.3:
+                os.write(number, repr(self.log[0]).encode())
+
+    def forget(self):
+        if self.files:
+            self.files.pop(self.chance.randrange(len(self.files))).close()
+
+    def look(self):
+        self.log.append((sorted(os.listdir(self.folder)), Path(self.named.name).exists()))
+
+    def any_file(self):
+        return self.chance.choice([*self.files, self.named])
+
+
+DEEDS = [
+    Archive.open_nameless, Archive.write, Archive.write, Archive.read, Archive.read, Archive.seek,
+    Archive.duplicate, Archive.use_numbers, Archive.forget,
+]  # fmt: skip
+
+
+def rest_of_archive(env, number=0):
+    """Play what is left of an episode. Returns its log."""
+    over = False
+    while not over:
+        over = env.step(3)[2]
+    return env.unwrapped.simulation.log
+
+
+def tree_of_archive(chance):
+    """Whether branches and clones in a tree have their archive's outcome: files, generators."""
+
+    def step(env):
+        told = env.step(3)
+        return repr(told), told[2]
+
+    env = single_env(Archive, choose)
+    return of_tree(chance, env, step, lambda env: env.unwrapped.simulation.log, ["fork"])
+
+
+def tree_of_yard(chance):
+    """Whether branches and clones in a tree have their yard's outcome: births, deaths, stacks."""
+    design = YardDesign(
+        machines=chance.randint(1, 4),
+        jobs=chance.randint(1, 3),
+        cranes=chance.randint(1, 3),
+        plans=chance.randint(1, 5),
+        luck=chance.randint(2, 6),
+        until=chance.choice([None, *range(3, 16)]),
+    )
+    make, driver = chance.choice([aec_env, parallel_env]), chance.choice(["greenlet", "thread"])
+    env = make(lambda: Yard(design), YARD_POINTS, driver=driver)
+    methods = ["replay", "fork"] if driver == "greenlet" else ["replay"]
+    return of_tree(
+        chance, env, move_trip, lambda env: yard_outcome(env.unwrapped.simulation), methods
+    )
+
+
+def of_tree(
+    chance,
+    env,
+    step,
+    come,
+    methods,
+):
+    """Whether an environment's clones, their clones and all branches have its outcome.
+
+    All move in a random order. A ``step`` returns what is told, and whether it was the last one.
+    ``come`` returns what has come of a simulation.
+    """
+
+    def rest(env, number, told):
+        """All that is told to the end, and what has come."""
+        told = [*told]
+        while not (told and told[-1][1]):
+            told.append(step(env))
+        return told, env.unwrapped.call(come)
+
+    env.reset(seed=chance.randrange(2**31))
+    nodes = [(env, [])]
+    for _ in range(chance.randrange(20, 60)):
+        one, told = chance.choice(nodes)
+        if told and told[-1][1]:
+            continue
+        if chance.random() < 0.3 and one.unwrapped.episode.pending is not None:
+            nodes.append((clone(one, method=chance.choice(methods)), [*told]))
+        else:
+            told.append(step(one))
+    ends, branched = {}, []
+    for one, told in chance.sample(nodes, len(nodes)):  # some outlive what they were cloned from
+        if one.unwrapped.episode.pending is not None:
+            branched += branch(one, partial(rest, told=told), method=chance.choice(methods))
+        ends[one] = rest(one, 0, told)
+        if one is not env:
+            one.close()
+    own = ends.pop(env)
+    env.close()
+    return [each == own for each in (*ends.values(), *branched)]
+
+
+def differing_branches(number, seed=0):
+    """How many of at least so many branches and clones differ, and of how many."""
+    chance, alike = random.Random(seed), []
+    while len(alike) < number:
+        alike += chance.choice([tree_of_archive, tree_of_yard])(chance)
+    return alike.count(False), len(alike)
+
+
+def main(number, kind="saved"):
+    """Print how many of so many continuations differ from their original."""
+    warnings.simplefilter("ignore")  # an archive draws from the global generators
+    if kind == "branches":
+        differ, number = differing_branches(number)
+        print(f"{differ} of {number:,} differ")
+        return
+    differ = []
+    for first in range(0, number, 200):
+        differ += differing(min(200, number - first), first)
+    print(f"{len(differ)} of {number:,} differ {differ[:20]}")
+
+
+if __name__ == "__main__":
+    from tests.worlds.saved import main as main_of  # its functions are of a module then
+
+    main_of(int(sys.argv[1]), *sys.argv[2:])

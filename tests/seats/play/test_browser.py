@@ -194,7 +194,7 @@ def free_port():
 def test_two_people_and_a_policy_go_on_after_a_crash(open_page, start, tmp_path):
     path, port = tmp_path / "game.jsonl", str(free_port())
     arguments = [
-        "--seat", "trader_0", "trader_1", "--policy", "trader_2=tests.seats.play.worlds:five",
+        "--seat", "trader_0", "trader_1", "--policy", "trader_2=tests.worlds.seats:five",
         "--port", port, "--record", str(path), "--time-unit", "round",
     ]  # fmt: skip
     server = start("--seed", "3", *arguments, simulation=MARKET)
@@ -282,7 +282,7 @@ def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, s
 
 def test_page_reports_a_slow_model_and_ignores_double_clicks(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
-    server = start("--record", str(path), simulation="tests.seats.play.worlds:SlowShop")
+    server = start("--record", str(path), simulation="tests.worlds.seats:SlowShop")
     page = open_page(server, "buyer")
     wait_for_turn(page)
     page.locator("#legend", has_text="computed").wait_for()  # futures take long, too
@@ -317,7 +317,7 @@ def test_page_shows_the_last_seconds_and_rejects_a_wrong_key(open_page, start):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_seats_with_any_name_are_played(open_page, start, scheme):
-    server = start("--seed", "1", simulation="tests.seats.play.worlds:OddShop")
+    server = start("--seed", "1", simulation="tests.worlds.seats:OddShop")
     lobby = open_page(server, "", color_scheme=scheme)
     lobby.get_by_text("Take").first.click()
     wait_for_turn(lobby)

@@ -29,8 +29,8 @@ from simenv_marl.seats.play.game import Game
 from simenv_marl.seats.play.host import Host, Rules
 from simenv_marl.seats.play.recording import read
 from tests.planning.test_candidates import Works, points
-from tests.seats.play.worlds import ORDER, BreakingShop, ClosingShop, FixedShop, Shop
 from tests.worlds import models
+from tests.worlds.seats import ORDER, BreakingShop, ClosingShop, FixedShop, Shop
 
 
 @pytest.fixture(autouse=True)

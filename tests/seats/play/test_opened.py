@@ -21,7 +21,7 @@ from simenv_marl.seats.play.start import open_game
 from tests.files.test_episodes import Reseeded
 from tests.worlds import saved
 from tests.worlds.random_worlds import HERE as YARDS
-from tests.worlds.random_worlds import POINTS, Yard, advised, outcome
+from tests.worlds.random_worlds import YARD_POINTS, Yard, yard_outcome, yard_policy
 from tests.worlds.saved import VANS, Depot, Pumps, cases, move, pushing, save, steady
 
 YARD = saved.partial(saved.yard, 3, 2, 2, 2, 3, None)
@@ -44,7 +44,7 @@ def open_at(path, until=None):
 def state_of(simulation):
     """Return what two simulations have alike."""
     if isinstance(simulation, Yard):
-        return outcome(simulation)
+        return yard_outcome(simulation)
     parts = {**vars(simulation)}
     chance = parts.pop("random")
     state = chance.getstate() if isinstance(chance, random.Random) else chance.bit_generator.state
@@ -54,12 +54,12 @@ def state_of(simulation):
 @pytest.mark.parametrize(
     ("make", "simulation", "points", "options"),
     [
-        (aec_env, YARD, POINTS, {}),
-        (aec_env, YARD, POINTS, {"policies": {f"{YARDS}.Machine.load": advised}}),
-        (parallel_env, YARD, POINTS, {}),
-        (parallel_env, YARD, POINTS, {"policies": {"planner": advised}}),
-        (turn_env, YARD, POINTS, {"flatten": True}),
-        (single_env, YARD, POINTS, {"agent": "planner"}),
+        (aec_env, YARD, YARD_POINTS, {}),
+        (aec_env, YARD, YARD_POINTS, {"policies": {f"{YARDS}.Machine.load": yard_policy}}),
+        (parallel_env, YARD, YARD_POINTS, {}),
+        (parallel_env, YARD, YARD_POINTS, {"policies": {"planner": yard_policy}}),
+        (turn_env, YARD, YARD_POINTS, {"flatten": True}),
+        (single_env, YARD, YARD_POINTS, {"agent": "planner"}),
         (aec_env, Depot, VANS, {"policies": {"van_1": pushing, "van_0": RULE}}),
         (turn_env, Depot, VANS, {"skip_forced": True}),
         (parallel_env, Depot, VANS, {}),
@@ -82,9 +82,9 @@ def test_opened_game_is_at_the_decision_of_its_file(make, simulation, points, op
 
 
 def test_a_game_begins_after_so_many_decisions(tmp_path):
-    save_episode(begun(aec_env, YARD, POINTS), tmp_path / "a")
+    save_episode(begun(aec_env, YARD, YARD_POINTS), tmp_path / "a")
     game = open_at(tmp_path / "a", until=3)
-    env = begun(aec_env, YARD, POINTS, taken=3)
+    env = begun(aec_env, YARD, YARD_POINTS, taken=3)
     assert (game.turn, game.now["agent"]) == (3, env.agent_selection)
     assert state_of(game.root.simulation) == state_of(env.simulation)
     game.close()

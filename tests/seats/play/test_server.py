@@ -33,9 +33,9 @@ from simenv_marl.seats.play import play  # noqa: E402
 from simenv_marl.seats.play.host import Rules  # noqa: E402
 from simenv_marl.seats.play.server import Table  # noqa: E402
 from simenv_marl.seats.play.start import find_game  # noqa: E402
-from tests.seats.play.worlds import Shop, five  # noqa: E402
+from tests.worlds.seats import Shop, five  # noqa: E402
 
-SHOP = "tests.seats.play.worlds:Shop"
+SHOP = "tests.worlds.seats:Shop"
 
 
 class Server:
@@ -278,14 +278,14 @@ def test_a_page_that_is_gone_leaves_no_task_and_no_link():
 
 
 def test_a_game_that_takes_long_is_killed_in_the_end():
-    server = Server("--seat", "buyer", simulation="tests.seats.play.worlds:EndlessShop")
+    server = Server("--seat", "buyer", simulation="tests.worlds.seats:EndlessShop")
     server.page("buyer").wait("state")
     assert server.end()[0] == 0
 
 
 def test_the_end_leaves_no_process(tmp_path):
     arguments = "--seat", "buyer", "--record", str(tmp_path / "game.jsonl")
-    server = Server(*arguments, simulation="tests.seats.play.worlds:ClosedShop")
+    server = Server(*arguments, simulation="tests.worlds.seats:ClosedShop")
     buyer = server.page("buyer")
     buyer.wait("fan")
     children = server.children()
@@ -318,9 +318,9 @@ def test_the_end_of_the_game_ends_the_server():
         ([SHOP, "--limit", "nan"], "limit"),
         ([SHOP, "--port", "99999"], "port 99999"),
         ([SHOP, "--host", "192.0.2.1"], "192.0.2.1"),
-        (["tests.seats.play.worlds:Shopp"], "did you mean"),
-        (["tests.seats.play.worlds:BrokenShop"], "the door is locked"),
-        (["tests.seats.play.worlds:LeavingShop"], "has ended, with exit code 3"),
+        (["tests.worlds.seats:Shopp"], "did you mean"),
+        (["tests.worlds.seats:BrokenShop"], "the door is locked"),
+        (["tests.worlds.seats:LeavingShop"], "has ended, with exit code 3"),
     ],
 )
 def test_play_command_reports_arguments_that_cannot_be_played(arguments, told, capsys):

@@ -1,8 +1,8 @@
-"""Entities that are born, decide and die, for the tests of many agents.
+"""Models whose agents are entities that are born, decide and are removed.
 
-``Being`` is an entity of no model in particular. ``Colony`` is a whole simulation, in which what is
-decided makes creatures be born and die, decide twice, or never; ``Answered`` is the same without
-the library, and notes what must come of it.
+``life`` plays a line of text: use it where a test needs one certain order of events. ``Colony``
+draws births and deaths: use it for properties of any order. ``AnsweredColony`` is the same
+without the library, and notes the decisions and rewards that a view must report.
 """
 
 import random
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, TRUNCATED, difference
+from simenv_marl import RULE, TRUNCATED, SimulationInterface, difference
 from tests.worlds.models import define
 
 HERE = __name__
@@ -84,7 +84,7 @@ def others(**changes):
 
 
 @dataclass(frozen=True)
-class Design:
+class ColonyDesign:
     """What a colony is like.
 
     Attributes:
@@ -105,8 +105,8 @@ class Design:
 MOST = 10
 ROSTER = [f"creature_{number}" for number in range(MOST)]
 
-designs = st.builds(
-    Design,
+colony_designs = st.builds(
+    ColonyDesign,
     initial=st.integers(1, 5),
     most=st.integers(5, MOST),
     ticks=st.integers(1, 6),
@@ -206,7 +206,7 @@ class Colony:
                 victim.die()
 
 
-class Announcing(Colony):
+class AnnouncingColony(Colony):
     """A colony that knows who is going to decide."""
 
     def expected_calls(self, point):
@@ -217,7 +217,7 @@ class Announcing(Colony):
         )
 
 
-class Answered(Colony):
+class AnsweredColony(Colony):
     """A colony without an environment, in which everybody answers as ``answer`` says.
 
     It keeps who has decided, in their order, and by agent the fortune at its first decision and at
@@ -303,13 +303,13 @@ def colony(make, design, simulation=Colony, *, roster=False):
     return _made[key]
 
 
-def advised(observation, seed):
+def colony_policy(observation, seed):
     """The answer of whoever makes that observation."""
     number, decided = int(observation[0]), int(observation[1])
     return answer(seed, f"creature_{number}" if number >= 0 else "overseer_0", decided)
 
 
-def played(env, seed, look=lambda agent: None):
+def play_colony(env, seed, look=lambda agent: None):
     """Play a colony; check PettingZoo's books at every step, and look at each decision.
 
     Returns who decided, the totals and the ends.
@@ -338,3 +338,75 @@ def played(env, seed, look=lambda agent: None):
         booked.update(env.rewards)
     assert {a: t for a, t in booked.items() if t} == {a: t for a, t in totals.items() if t}
     return decided, totals, ends
+
+
+class Life(SimulationInterface):
+    """A simulation of ten beings; ``now`` is told as its time where it is timed."""
+
+    def __init__(self, program, announced, ends, kind):
+        self.program, self.announced, self.ends, self.kind = program, announced, ends, kind
+
+    def reset(self, seed=None):
+        self.seed, self.now = seed, 0.0
+        self.log = []
+        self.asked = []
+        self.beings = {number: self.kind(number) for number in range(10)}
+
+    def run(self):
+        for number, what, *value in map(str.split, self.program.split(", ")):
+            if what == "o'clock":
+                self.now = float(number)
+            else:
+                self.happens(int(number), what, *map(int, value))
+        return self.ends
+
+    def happens(self, number, what, *value):
+        """Let one thing happen to a being; whatever else it is is set."""
+        if what == "acts":
+            self.log.append(self.beings[number].act())
+        elif what == "leaves":
+            self.beings[number].leave()
+        elif what == "banished":
+            banish("nowhere", self.beings[number])
+        elif what == "ends":  # without any call that could be named
+            self.end_agent(None)  # nobody
+            self.end_agent(being_of(self.beings[number]))
+        elif what == "forgotten":
+            del self.beings[number]
+        elif what == "fails":
+            raise ZeroDivisionError
+        else:
+            setattr(self.beings[number], what, *value)
+
+
+class AnnouncingLife(Life):
+    """One that knows who is going to decide."""
+
+    def expected_calls(self, point):
+        self.asked.append(point)
+        return [(self.beings[number],) for number in self.announced or ()]
+
+
+def life(
+    program,
+    *,
+    announced=None,
+    timed=False,
+    ends=None,
+    kind=Being,
+):
+    """A factory of lives, as ``life("0 acts, 0 health 5, 0 leaves, 1 acts")``."""
+    base = Life if announced is None else AnnouncingLife
+    if timed:
+        base = type("Timed", (base,), {"time": lambda self: self.now})
+    return lambda: base(program, announced, ends, kind)
+
+
+def story(turns):
+    """Who decides, is removed and is truncated, in the order of turns."""
+    words = []
+    for turn in turns:
+        words.append(
+            turn.agent.removeprefix("being_") + "+" * turn.terminated + "~" * turn.truncated
+        )
+    return " ".join(words)

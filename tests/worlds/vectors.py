@@ -1,8 +1,15 @@
-"""Models for vector environments, and what it means that two of these tell the same."""
+"""Models for vector environments, spaces of all kinds, and wrappers.
+
+``Counter`` has one agent; ``VARIETY`` defines its decision with each kind of space. ``agree``
+compares our vector environments with Gymnasium's. ``DialSim`` and ``DialEnv`` are one model with a
+picture, as a simulation and written by hand: use them to compare wrappers.
+"""
 
 import multiprocessing
 from functools import partial
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,7 +17,8 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vector_env
-from tests.worlds.worlds import World, advised, agent_of, points_of
+from tests.worlds.models import define
+from tests.worlds.random_worlds import World, agent_of, points_of, world_policy
 
 MODES = list(AutoresetMode)
 
@@ -67,7 +75,7 @@ class Counter:
 POINT = f"{__name__}.Counter.decide"
 
 
-class Timed(Counter):
+class TimedCounter(Counter):
     """The same with a clock."""
 
     def time(self):
@@ -85,8 +93,8 @@ NESTED = spaces.Dict(
 
 VARIETY = {
     "plain": (Counter, definition()),
-    "timed": (Timed, definition()),
-    "masked": (Timed, definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])),
+    "timed": (TimedCounter, definition()),
+    "masked": (TimedCounter, definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])),
     "choices": (Counter, definition(
         action_space=spaces.Discrete(4),
         action_space_mapping=None,
@@ -190,7 +198,7 @@ def agree(ours, theirs, steps, rng):
 def made(design, number, mode, *, sync=False, **options):
     """A vector environment of worlds of a design, ours or Gymnasium's; None if it is impossible."""
     points = points_of(design)
-    policies = {points[point]: advised for point in design.policies} | {
+    policies = {points[point]: world_policy for point in design.policies} | {
         points[point]: RULE for point in design.rules
     }
     entities = [
@@ -213,3 +221,123 @@ def made(design, number, mode, *, sync=False, **options):
         return vector_env(source, points, num_envs=number, autoreset_mode=mode, **options)
     make = single_env if single else joint_env
     return SyncVectorEnv([lambda: make(source, points, **options)] * number, autoreset_mode=mode)
+
+
+class Dial:
+    """Is turned a few times, with another start in each episode."""
+
+    def __init__(self, episode):
+        self.place, self.turns = 1.0 + episode / 4, 0
+
+    @property
+    def ended(self):
+        return self.turns == 5
+
+    @property
+    def truncated(self):
+        return self.place > 1.5
+
+    def choose(self):
+        return 0.5
+
+    def turn(self, by):
+        self.place, self.turns = self.place + by, self.turns + 1
+
+    def picture(self):
+        return (np.arange(72).reshape(6, 4, 3) * (self.turns + 1) + int(self.place * 10)).astype(
+            np.uint8
+        )
+
+
+def turned_by(action):
+    return float(action[0] - action[1] / 2)
+
+
+ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
+SEEN = {
+    "numbers": (
+        spaces.Box(-10, 10, (4,), np.float32),
+        lambda dial: np.array([dial.place, dial.turns, dial.place**2 / 10, 1], np.float32),
+    ),
+    "picture": (spaces.Box(0, 255, (6, 4, 3), np.uint8), Dial.picture),
+    "parts": (
+        spaces.Dict({"place": spaces.Box(-10, 10, (1,), np.float64), "turns": spaces.Discrete(9)}),
+        lambda dial: {"place": np.array([dial.place]), "turns": np.int64(dial.turns)},
+    ),
+}
+"""What may be seen of a dial: in which space, and what."""
+
+
+class DialSim:
+    """Turns dials."""
+
+    render_modes = ("rgb_array",)
+    render_fps = 200
+    episodes = 0
+
+    def reset(self):
+        self.episodes += 1
+        self.dial = Dial(self.episodes)
+
+    def run(self):
+        while not self.dial.ended:
+            self.dial.turn(self.dial.choose())
+        return TRUNCATED if self.dial.truncated else None
+
+    def time(self):
+        return float(self.dial.turns)
+
+    def render(self, mode):
+        return self.dial.picture()
+
+
+class DialEnv(gymnasium.Env[Any, Any]):
+    """The same, written by hand."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's way
+    action_space = ACTIONS
+    episodes = 0
+
+    def __init__(self, seen="numbers", *, render_mode=None):
+        self.observation_space, self.look = SEEN[seen]
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episodes += 1
+        self.dial = Dial(self.episodes)
+        return self.look(self.dial), {"time": 0.0, "elapsed": 0.0}
+
+    def step(self, action):
+        self.dial.turn(turned_by(action))
+        ended, truncated = self.dial.ended, self.dial.truncated
+        info = {"time": float(self.dial.turns), "elapsed": 1.0}
+        return (
+            self.look(self.dial),
+            self.dial.place,
+            ended and not truncated,
+            ended and truncated,
+            info,
+        )
+
+    def render(self):
+        return self.dial.picture()
+
+
+def dial_points(seen):
+    """The decision point of dials of which that is seen."""
+    space, look = SEEN[seen]
+    definition = define(
+        agent="hand_0",
+        observation_space=space,
+        observation_space_mapping=look,
+        action_space=ACTIONS,
+        action_space_mapping=turned_by,
+        reward_mapping=lambda dial: dial.place,
+    )
+    return {Dial.choose: definition}
+
+
+def dial_env(seen="numbers", **options):
+    """The single view of a simulation of dials."""
+    return single_env(DialSim, dial_points(seen), **options)

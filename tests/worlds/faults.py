@@ -1,4 +1,8 @@
-"""A simulation with faults anywhere: in the model, its mappings, policies and handlers."""
+"""A model that fails, ends or interrupts at any place: in its code, mappings, policies or handlers.
+
+``farm_env`` makes an environment of a ``Farm`` in any view; ``farm.let(happen, place)`` chooses the
+fault and its place. Faults of a simulator in another process are in ``outside.py``.
+"""
 
 import json
 import random

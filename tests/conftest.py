@@ -10,17 +10,8 @@ from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 from simenv_marl.core.plans.options import Options
 from simenv_marl.core.switching import opened
+from tests import extent
 from tests.worlds.models import DRIVERS
-
-# Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
-settings.register_profile(
-    "tests",
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-settings.load_profile("tests")
 
 # A shell that starts the tests in the background has them ignore interrupts, which some are about.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -1,5 +1,6 @@
 """How many random examples a test tries: few in `make test`, all in `make test-thorough`."""
 
+import pytest
 from hypothesis import settings
 
 QUICK = 0.1
@@ -11,3 +12,8 @@ share = 1.0
 def examples(number):
     """Settings of a property test that tries so many examples, or their share."""
     return settings(max_examples=max(2, round(share * number)))
+
+
+def thorough(*values):
+    """Values of a parameter that `make test` leaves out."""
+    return [pytest.param(value, marks=pytest.mark.thorough) for value in values]

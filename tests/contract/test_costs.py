@@ -17,6 +17,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.errors import DefinitionError, RewardError
+from tests.extent import examples
 from tests.worlds.models import calling, decision, define, play, script
 from tests.worlds.random_worlds import YARD_POINTS, YARD_ROSTER, Yard, seeds, yard_designs
 
@@ -66,7 +67,7 @@ def pairs(make, yard, points, options, seed):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-@settings(max_examples=25)
+@examples(25)
 @given(design=yard_designs, seed=seeds, skip=st.booleans(), masked=st.booleans())
 def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
     options = {"skip_forced": skip}

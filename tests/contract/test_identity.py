@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
+from tests.extent import examples
 from tests.worlds.models import VIEWS, follow_the_rule
 from tests.worlds.random_worlds import (
     HERE,
@@ -56,7 +57,7 @@ def made(view, design, **options):
 
 
 @given(yard_designs, seeds, OPTIONS)
-@settings(max_examples=150)
+@examples(150)
 def test_every_view_stepped_with_rule_matches_the_plain_run(design, seed, options):
     expected = yard_outcome(plain_yard(design, seed))
     for view in VIEWS:
@@ -166,7 +167,7 @@ uses = st.lists(
 @given(
     yard_designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses
 )
-@settings(max_examples=120)
+@examples(120)
 def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:

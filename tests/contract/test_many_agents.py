@@ -25,6 +25,7 @@ from simenv_marl.errors import (
     UnknownAgentError,
     UnknownPointError,
 )
+from tests.extent import examples
 from tests.worlds import entities
 from tests.worlds.entities import (
     HERE,
@@ -572,7 +573,7 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 
 @given(colony_designs, seeds)
-@settings(max_examples=120)
+@examples(120)
 def test_random_colony_in_the_aec_view_matches_the_plain_run(design, seed):
     plain = AnsweredColony(design, seed)
     if not plain.decisions:

@@ -18,6 +18,7 @@ from simenv_marl.errors import (
     NotResetError,
     UnknownAgentError,
 )
+from tests.extent import examples
 from tests.worlds.entities import (
     AnnouncingColony,
     AnsweredColony,
@@ -448,7 +449,7 @@ def played(env, seed, in_turns):
 
 
 @given(colony_designs, seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
     plain = AnsweredColony(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}

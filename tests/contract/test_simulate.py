@@ -16,6 +16,7 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
+from tests.extent import examples
 from tests.worlds.entities import (
     HERE,
     AnsweredColony,
@@ -92,7 +93,7 @@ def test_simulate_refuses_invalid_arguments(run, arguments, error, match):
 
 
 @given(colony_designs, seeds)
-@settings(max_examples=40)
+@examples(40)
 def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
     plain = AnsweredColony(design, seed)
     points = colony_points(overseen=bool(design.overseen))

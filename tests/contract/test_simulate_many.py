@@ -16,6 +16,7 @@ from simenv_marl import RULE, evaluate, simulate, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import InvalidActionError, MissingExtraError, OptionValueError
 from simenv_marl.experiments import run_experiment
+from tests.extent import examples
 from tests.worlds.models import calling, decision, define, fails, notes, plainly, script, stacks
 from tests.worlds.random_worlds import World, points_of, world_designs, world_policy
 from tests.worlds.vectors import same
@@ -60,7 +61,7 @@ going = {Going.decide: define(agent="going_0")}
 
 
 @given(world_designs(), some_seeds, sizes)
-@settings(max_examples=60)
+@examples(60)
 def test_simulate_many_matches_simulate_one_by_one(design, seeds, size):
     """All kinds of decision points: nested, generators, with choices, of entities, named late."""
 

@@ -15,6 +15,7 @@ from simenv_marl import (
     turn_env,
 )
 from simenv_marl.errors import OptionValueError, RewardError
+from tests.extent import examples
 from tests.worlds.models import calling, decision, define, play, script
 from tests.worlds.random_worlds import YARD_POINTS, YARD_ROSTER, Yard, seeds, yard_designs
 
@@ -114,7 +115,7 @@ def earned(yard):
 
 
 @given(yard_designs, seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
     options = {
         "possible_agents": YARD_ROSTER,
@@ -154,7 +155,7 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
 
 
 @given(yard_designs, seeds)
-@settings(max_examples=30)
+@examples(30)
 def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, seed):
     env = parallel_env(
         lambda: Yard(design),

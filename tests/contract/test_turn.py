@@ -10,6 +10,7 @@ from hypothesis import given
 
 from simenv_marl import RULE, aec_env, clone, generate_env, turn_env, vector_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError, UnknownOptionError, ViewError
+from tests.extent import examples
 from tests.worlds import random_worlds
 from tests.worlds.models import Timed, calling, decision, script
 
@@ -67,7 +68,7 @@ def compared(aec, turn, seed, action_of):
 
 
 @given(random_worlds.yard_designs, random_worlds.seeds)
-@settings(max_examples=60)
+@examples(60)
 def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
     options = {"possible_agents": random_worlds.YARD_ROSTER}
     compared(
@@ -79,7 +80,7 @@ def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
 
 
 @given(random_worlds.world_designs(), random_worlds.seeds, random_worlds.answers)
-@settings(max_examples=100)
+@examples(100)
 def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
     points = random_worlds.points_of(design)
     policies = {points[point]: random_worlds.world_policy for point in design.policies} | {

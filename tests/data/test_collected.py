@@ -13,6 +13,7 @@ from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row, ones
+from tests.extent import examples
 from tests.worlds.entities import (
     AnnouncingColony,
     Being,
@@ -101,7 +102,7 @@ def check(found, episodes, chosen):
 
 
 @given(colony_designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
-@settings(max_examples=60)
+@examples(60)
 def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
     def policy(observation, info):
         number = int(observation.sum()) % 6
@@ -126,7 +127,7 @@ def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, 
 
 
 @given(world_designs(), some_seeds, sizes)
-@settings(max_examples=80)
+@examples(80)
 def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
     def simulation():
         return World(design, points)

@@ -79,7 +79,7 @@ def checking_one(observation, info, *, _state):
 
 
 @given(yard_designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
-@settings(max_examples=40)
+@examples(40)
 def test_trajectories_have_the_states_at_decisions_and_ends(design, several, size, most):
     found = collect_episodes(
         lambda: Yard(design),
@@ -104,7 +104,7 @@ def test_trajectories_have_the_states_at_decisions_and_ends(design, several, siz
 
 
 @given(yard_designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
-@settings(max_examples=20)
+@examples(20)
 def test_states_of_observations_match_an_aec_environment(design, several, whose):
     options = {
         "points": YARD_POINTS,

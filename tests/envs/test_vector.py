@@ -28,6 +28,7 @@ from simenv_marl.errors import (
     ViewError,
     WrongThreadError,
 )
+from tests.extent import examples
 from tests.worlds.copied import IDS, Voyage
 from tests.worlds.models import decision, fails, script, stacks
 from tests.worlds.random_worlds import seeds, world_designs

@@ -18,6 +18,7 @@ from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError
 from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
 from simenv_marl.planning import RolloutPolicy
 from simenv_marl.seats import describe
+from tests.extent import examples
 from tests.worlds.models import Script, define
 from tests.worlds.random_worlds import FAIR_POINTS, FAIR_POLICIES, Fair, boldest, fair_policy
 

@@ -314,6 +314,7 @@ def test_actions_are_replayed_as_they_were_given():
         assert len(asked) == before
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_branches_and_clones_of_random_worlds_are_exact():
     """Also of files and of global generators.
@@ -408,6 +409,7 @@ def held_by(model):
     return begun(single_env(model, choose), 4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("held", "name"),
     [
@@ -449,6 +451,7 @@ def test_memory_that_no_process_can_change_is_forked(held):
         assert branch(env, rest_of_archive, 1, method="fork") == [rest_of_archive(env)]
 
 
+@pytest.mark.thorough
 def test_memory_that_was_shared_before_the_import_does_not_count():
     code = """
 import mmap
@@ -522,6 +525,7 @@ def test_simulations_with_an_epoll_object_are_replayed():
     assert rest_of_archive(env) == [1, 0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("flush", [False, True])
 def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
     code = f"""

@@ -34,6 +34,7 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from tests.core.test_global_rng import world
+from tests.extent import thorough
 from tests.processes import ROOT, alone, descriptors, gone, runs
 from tests.test_branch import METHODS, ahead, children
 from tests.worlds.copied import POINTS, VIEWS, Free, Lucky, Trip, future, move, outcome, trip
@@ -51,14 +52,19 @@ OPTIONS = {
     },
 }  # fmt: skip
 
+FEW_VIEWS = ("aec", "parallel", "single, limited", "joint")
+EVERY_VIEW = pytest.mark.parametrize(
+    "view", [*FEW_VIEWS, *thorough(*(view for view in VIEWS if view not in FEW_VIEWS))]
+)
+
 
 def number_of(twin):
     return twin.unwrapped.call(lambda env: os.getpid())
 
 
 @METHODS
-@pytest.mark.parametrize("options", OPTIONS)
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("options", ["lucky", *thorough("plain", "short")])
+@EVERY_VIEW
 def test_clones_and_branches_continue_alike_and_independently(view, options, method):
     given = dict(OPTIONS[options])
     if (options, method) == ("short", "replay"):  # threads cannot be forked
@@ -126,6 +132,7 @@ def test_checkpoint_rewinds_after_its_original_is_closed(method):
     assert found == [future(trip("single, limited", taken=2))] * 7 == [future(checkpoint)] * 7
 
 
+@pytest.mark.thorough
 def test_clones_have_many_generations_and_end_when_they_are_collected():
     twin, numbers = clone(trip(), method="fork"), []
     for _ in range(30):
@@ -138,6 +145,7 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
     assert gone(number)
 
 
+@pytest.mark.thorough
 @METHODS
 def test_clones_keep_the_step_count_of_wrappers(method):
     env = trip("single, limited", Free)
@@ -155,6 +163,7 @@ def test_clones_keep_the_step_count_of_wrappers(method):
     assert last.step(1)[3] is outer.step(1)[3] is True
 
 
+@pytest.mark.thorough
 def test_call_runs_functions_in_the_process_of_the_clone():
     twin, factor = clone(trip(), method="fork"), 2
     assert number_of(twin) != os.getpid() == number_of(clone(twin, method="replay"))
@@ -172,7 +181,7 @@ def test_call_runs_functions_in_the_process_of_the_clone():
 
 
 @METHODS
-@pytest.mark.parametrize("view", VIEWS)
+@EVERY_VIEW
 def test_errors_in_clones_keep_their_type(view, method):
     failing = type("Failing", (Free,), {"luck": lambda trip: 1 / (1 - trip.day)})
     twin = clone(trip(view, failing, taken=0), method=method)
@@ -214,6 +223,7 @@ def fail(*_):
     raise OSError(errno.EAGAIN, "no more")
 
 
+@pytest.mark.thorough
 @METHODS
 def test_a_clone_that_cannot_be_made_leaves_nothing(method, monkeypatch):
     faulty, fixed = (
@@ -272,6 +282,7 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
     assert children() - before == set()  # those of earlier tests may end meanwhile
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("end", [lambda twins: twins[0].close(), list.clear])
 @pytest.mark.parametrize(("use", "told"), USES)
 def test_only_episodes_that_begin_in_a_clone_are_unwound_and_closed(use, told, end, tmp_path):
@@ -333,6 +344,7 @@ ENDS = [
 ENDS += [(INTERRUPTED, "BranchError: the clone is gone: it was ended by an interrupt")]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("end", "error"), ENDS)
 def test_clones_end_with_the_users_process_and_ignore_interrupts(end, error, tmp_path):
     command, told = [sys.executable, "-c", USER + end, str(tmp_path)], tmp_path / "told"
@@ -483,6 +495,7 @@ def lean():
             assert each.call(lambda env: len(descriptors())) == number - (each is other)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("function", [crowd, starve, lean])
 def test_clones_use_one_descriptor_each_and_leak_none(function):
     alone(function)
@@ -498,6 +511,7 @@ class Cyclic:
         self.me = self
 
 
+@pytest.mark.thorough
 def test_forked_clones_free_objects_that_the_original_frees():
     env = trip()
     model = env.simulation
@@ -515,6 +529,7 @@ def test_forked_clones_free_objects_that_the_original_frees():
     assert found == [count(env)] * 3 == [1] * 3
 
 
+@pytest.mark.thorough
 def test_closed_clone_within_a_chain_of_clones_is_freed():
     twin = clone(trip(), method="fork")
     depth = twin.call(lambda env: len(inspect.stack()))
@@ -551,6 +566,7 @@ class Broken(Trip):
         return [self.place, (None if self.broken is None else 1 / 0) or self.day]
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
 def test_model_error_surfaces_before_the_errors_that_follow_from_it(view, method):
@@ -598,6 +614,7 @@ def test_an_info_that_cannot_be_sent_is_named_and_hides_no_error(kind):
         clone(env, method="fork")
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
 @pytest.mark.parametrize("kind", unsendable())
@@ -644,6 +661,7 @@ def reap(order):
     assert children() == set()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", ["0123", "3210", "1032", "0213"])
 def test_closed_clones_leave_no_zombie_to_a_first_process(order):
     alone(reap, order)
@@ -696,6 +714,7 @@ def handled(place):
     assert {*Path(place).read_text(encoding="utf-8").split()} == {str(os.getpid())}
 
 
+@pytest.mark.thorough
 def test_signal_handlers_of_the_user_do_not_run_in_clones(tmp_path):
     alone(handled, str(tmp_path / "signals"))
 
@@ -710,6 +729,7 @@ def hold(env, number=0):
     HELD.acquire()
 
 
+@pytest.mark.thorough
 def test_fork_that_waits_for_a_lock_forever_raises_an_error():
     HELD.acquire()  # as by a thread that is not in the fork
     env = trip()
@@ -761,6 +781,7 @@ def by_hand(env):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
+@pytest.mark.thorough
 @FORKS
 @pytest.mark.parametrize(
     "forked",

@@ -95,6 +95,7 @@ class Limited(Duel):
         return TRUNCATED
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("view", VIEWS)
@@ -123,6 +124,7 @@ def test_values_in_mid_episode_belong_to_the_pending_decision(view):
     assert told.best == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -149,6 +151,7 @@ def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, 
     assert found.returns == pytest.approx(table)
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
 def test_the_base_is_a_policy_of_the_agent_or_policies_by_agent(view, method):
@@ -255,6 +258,7 @@ class Mortal(Duel):
     ceiling = 3.0
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
@@ -493,6 +497,7 @@ def test_branches_are_not_rendered():
     assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
 def test_rewards_of_rounds_without_the_agent_count_for_its_last_decision(wrapper):
     class Unannounced(Duel):

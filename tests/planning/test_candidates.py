@@ -271,6 +271,7 @@ def test_a_callable_proposes_candidates():
     assert asked[1][3] == 5
 
 
+@pytest.mark.thorough
 def test_box_candidates_search_around_the_incumbent():
     space = spaces.Box(0.5, 8.0, (1,), np.float64)
     changes = {"action_space": space, "action_space_mapping": lambda action: float(action[0])}
@@ -323,6 +324,7 @@ def test_every_option_keeps_the_choice_between_planned_decisions(driver):
     assert len(planned) == -(-len(works.log) // 3)
 
 
+@pytest.mark.thorough
 def test_the_incumbent_stays_a_candidate_while_it_is_held():
     env = one_agent()
     planner = patient(hold=3)
@@ -336,6 +338,7 @@ def test_the_incumbent_stays_a_candidate_while_it_is_held():
         assert told.best is long, held
 
 
+@pytest.mark.thorough
 @METHODS
 def test_clones_take_the_incumbent_along(method):
     env = one_agent()
@@ -349,6 +352,7 @@ def test_clones_take_the_incumbent_along(method):
         each.close()
 
 
+@pytest.mark.thorough
 @METHODS
 def test_clones_go_on_with_the_choices_of_planners_in_policies(method):
     planner = RolloutPolicy([short, long], futures=2, metric=lambda works: works.clock, every=3)

@@ -78,6 +78,7 @@ def stop(simulation):
     raise TimeoutError
 
 
+@pytest.mark.thorough
 def test_long_run_in_workers_reports_the_cost_once(capfd):
     planner = RolloutPolicy([[0, 1], [1, 0]], futures=1, budget=5, every=12)
     # Workers of other tests would print elsewhere.
@@ -89,6 +90,7 @@ def test_long_run_in_workers_reports_the_cost_once(capfd):
     assert len(re.findall("an episode", capfd.readouterr().err)) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
 def test_all_planners_report_the_cost_of_a_decision(kind, monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.01)
@@ -123,6 +125,7 @@ def test_measuring_the_cost_of_a_decision_does_not_change_results(monkeypatch, c
     assert SAID.search(capfd.readouterr().err)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("run", RUNS)
 def test_bars_show_the_remaining_time(run, tmp_path, capfd):
     RUNS[run](tmp_path, progress=True)

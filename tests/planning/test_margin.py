@@ -82,6 +82,7 @@ def test_candidates_no_better_than_the_rule_are_not_taken(kind):
     assert share_of_rule(kind, world(), 0.0, 3) == 1.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("futures", "fresh"), [(3, 8), (12, 12)])
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
 def test_best_candidate_is_compared_with_the_rule_on_fresh_futures(
@@ -104,6 +105,7 @@ def test_best_candidate_is_compared_with_the_rule_on_fresh_futures(
     assert not set(confirmed) & set(searched)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
 @pytest.mark.filterwarnings("ignore:SomeWorld cannot draw")
 def test_margin_is_ignored_if_there_is_one_exact_future(kind):

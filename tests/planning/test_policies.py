@@ -121,6 +121,7 @@ def test_rollout_candidates_of_a_budget_round_share_their_futures(wide):
     assert told.returns[0, :4].tolist() == action_values(wide, [2], futures=4).returns[0].tolist()
 
 
+@pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
@@ -141,6 +142,7 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
     assert env.simulation.value == by_hand()[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("down", "method", "batch_size"), [(False, "replay", 1), (True, "replay", 8), (True, "fork", 8)]
 )
@@ -182,6 +184,7 @@ def test_planners_can_be_compared_with_the_rule():
     assert told.trajectories.actions.tolist() == [1] * 12
 
 
+@pytest.mark.thorough
 def test_planners_decide_in_vector_environments():
     envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
@@ -265,6 +268,7 @@ def test_each_entity_plans_for_its_own_return():
     assert told.sum == 6 * 9
 
 
+@pytest.mark.thorough
 @METHODS
 def test_policies_that_branch_do_not_recurse_into_each_other(method):
     """In a branch of one agent, the other follows its base or its rule: branches do not nest."""
@@ -382,6 +386,7 @@ class Lends(Unseeded):
         return 1
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
 @pytest.mark.parametrize(
     ("model", "most", "cost"),
@@ -444,6 +449,7 @@ def far_sighted(observation, *, _environment):
     return 1
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
 @pytest.mark.parametrize("policy", [TreeSearchPolicy(depth=5, futures=8), far_sighted])
 def test_policies_plan_and_play_clones_up_to_the_end(policy, monkeypatch):

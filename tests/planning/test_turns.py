@@ -64,6 +64,7 @@ def test_values_match_clones_that_are_stepped_by_hand(base, given, method):
     assert told.returns == pytest.approx(np.array(table))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("flatten", [False, True])
 def test_values_with_births_and_deaths_match_stepping_by_hand(flatten):
     class Yard(random_worlds.Yard):
@@ -110,6 +111,7 @@ def paced(seen):
     return int(seen[0]) % 3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("view", ["turn", "aec", "parallel", "joint"])
 def test_base_for_all_agents_matches_bases_by_agent(view):
     bases = [
@@ -130,6 +132,7 @@ def test_base_for_all_agents_matches_bases_by_agent(view):
     assert table == [pytest.approx(table[0])] * len(table)
 
 
+@pytest.mark.thorough
 def test_policies_that_plan_take_bases_for_all_agents():
     turn = turn_policy(lambda seen: paced(seen["observation"]), like=made())
     values = []
@@ -215,6 +218,7 @@ def in_turn(actions):
     return lambda *_: next(left, RULE)
 
 
+@pytest.mark.thorough
 @METHODS
 @ONE_FUTURE
 def test_trees_of_turn_views_find_the_best_sequence(method):

@@ -134,6 +134,7 @@ def test_free_text_may_be_an_observation():
         turn_env(Tank, points)
 
 
+@pytest.mark.thorough
 def test_check_finds_nothing_in_a_simulation_with_free_text():
     report = check_simulation(partial(Tank), POINTS, episodes=2)
     assert "error" not in {finding.severity for finding in report.findings}

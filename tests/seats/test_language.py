@@ -84,6 +84,7 @@ def test_wrong_answer_is_corrected_in_the_conversation():
     assert "- closed\n- half\n- open" in correction["content"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("answer", [
     fails(500), fails(503), fails(429, retry_after="0"), "<html>busy</html>",
     says(None, refusal="I would rather not"), says("  "), {"object": "something else"}, 2.0,
@@ -94,6 +95,7 @@ def test_temporary_failures_are_tried_again(answer):
     assert len(requests) == 6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("answer", "kind", "error", "match"), [
     (fails(500), "http", LanguageModelError, "fake cannot be asked"),
     ("<html>down</html>", "failed", LanguageModelError, "fake gave no answer"),
@@ -145,6 +147,7 @@ def test_another_error_leaves_structured_output_as_it_is(answer, kind):
     assert policy.counts[kind] == 5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrap", [lambda make: None, lambda make: make(), lambda make: make])
 def test_each_process_has_its_own_connection(wrap):
     async def closing(observation):

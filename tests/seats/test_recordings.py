@@ -120,6 +120,7 @@ def nested(outer, policy, path, **options):
     return RecordedPolicy(guarded, path), guarded
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("policy", [unreliable, slow])
 @pytest.mark.parametrize("outer", [FallbackPolicy, RecordedPolicy])
 def test_fallback_and_recording_repeat_a_run_in_either_nesting(policy, outer, path):

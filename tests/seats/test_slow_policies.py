@@ -62,6 +62,7 @@ def compared(policy):
     return found.policy_actions.tolist()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("run", "plain"),
     [
@@ -360,6 +361,7 @@ def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
 # -- in clones ------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_bases_that_are_coroutines_are_replaced_by_the_rule():
     async def never(observation):
         raise AssertionError("it is asked in a branch")

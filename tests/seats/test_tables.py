@@ -106,6 +106,7 @@ def test_recorded_table_is_repeated_exactly_without_requests(runs):
     assert_frame_equal(*counts, check_exact=True)
 
 
+@pytest.mark.thorough
 def test_wrong_answer_of_the_model_is_parsed_or_the_rule_decides(runs):
     _, _, lines = runs
     for line in lines:

@@ -173,6 +173,7 @@ async def sometimes(observation, *, _decision):
     return 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", [0, 2])
 def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
     guarded, seeds = FallbackPolicy(sometimes), range(4)

@@ -531,6 +531,7 @@ def test_futures_refuse_a_wrong_hold(make_host, hold):
         host.handle("clerk", {"do": "horizon", "n": 5, "hold": hold})
 
 
+@pytest.mark.thorough
 def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
     host = make_host()
     settle(host)
@@ -838,6 +839,7 @@ OLD = [
 ]
 
 
+@pytest.mark.thorough
 def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     before = make_host(seats=())

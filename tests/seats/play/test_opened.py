@@ -51,6 +51,7 @@ def state_of(simulation):
     return repr((parts, state))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("make", "simulation", "points", "options"),
     [
@@ -122,6 +123,7 @@ def test_a_game_of_a_reseeded_clone_is_refused(tmp_path):
         open_at(tmp_path / "a")
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("seed", range(0, 60, 20))
 def test_opened_games_of_random_worlds_are_at_the_decision_of_the_file(seed, tmp_path):

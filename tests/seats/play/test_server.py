@@ -220,6 +220,7 @@ def test_an_illegal_action_comes_back_as_text(buyer):
     buyer.wait_for_turn(1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "headers",
     [
@@ -244,6 +245,7 @@ def test_server_refuses_other_origins_and_serves_all_its_pages(server):
         assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
 
 
+@pytest.mark.thorough
 def test_a_flood_from_one_page_does_not_keep_another_from_playing(page, buyer):
     flood = page("seller")
     flood.socket.socket.settimeout(0.2)
@@ -277,12 +279,14 @@ def test_a_page_that_is_gone_leaves_no_task_and_no_link():
     asyncio.run(visit())
 
 
+@pytest.mark.thorough
 def test_a_game_that_takes_long_is_killed_in_the_end():
     server = Server("--seat", "buyer", simulation="tests.worlds.seats:EndlessShop")
     server.page("buyer").wait("state")
     assert server.end()[0] == 0
 
 
+@pytest.mark.thorough
 def test_the_end_leaves_no_process(tmp_path):
     arguments = "--seat", "buyer", "--record", str(tmp_path / "game.jsonl")
     server = Server(*arguments, simulation="tests.worlds.seats:ClosedShop")
@@ -298,6 +302,7 @@ def test_the_end_leaves_no_process(tmp_path):
     assert (tmp_path / "game.jsonl").read_text().count("\n") == 1
 
 
+@pytest.mark.thorough
 def test_the_end_of_the_game_ends_the_server():
     server = Server()
     (game,) = [
@@ -365,6 +370,7 @@ def test_a_game_of_the_command_line_has_policies():
         find_game(found.get, "shop", ["five"], **options)
 
 
+@pytest.mark.thorough
 def test_a_resumed_game_has_the_same_links(tmp_path):
     arguments = "--seed", "5", "--record", str(tmp_path / "game.jsonl")
     server = Server(*arguments)
@@ -381,6 +387,7 @@ def test_a_resumed_game_has_the_same_links(tmp_path):
     assert (tmp_path / "game.jsonl.keys").stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.thorough
 def test_a_file_of_an_episode_is_opened_at_a_decision(tmp_path):
     env = parallel_env(Shop)
     env.reset(seed=5)
@@ -415,6 +422,7 @@ def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):
     assert "link of this seat" in lobby.wait("error")["text"]
 
 
+@pytest.mark.thorough
 def test_the_lobby_never_gives_the_link_of_the_facilitator():
     server = Server("--tools", "facilitator")
     lobby = server.page()

@@ -8,7 +8,7 @@ BIN := .venv/bin
 # Tests start hundreds of processes, each of which would compile the library anew where this is set.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-language test-openenv test-openai test-trl test-negotiation test-clients test-benchmarl test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-parts test-thorough test-studies test-all test-wheel test-templates test-pythons test-language test-openenv test-openai test-trl test-negotiation test-clients test-benchmarl test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -27,10 +27,19 @@ FORKING := tests/planning tests/seats tests/test_branch.py tests/test_clone.py d
 # What test-studies runs, and what test-outside runs because it needs more than a compiler.
 STUDIES := tests/studies tests/test_benchmarks.py
 ELSEWHERE := $(STUDIES) $(addprefix tests/outside/test_,$(addsuffix .py,energyplus enki fmi ros))
+# Tests that are marked thorough, and most random examples, are left to test-thorough: see docs/contributing.md.
+EXTENT := quick
 test: .venv/.test
 	$(MAKE) --jobs 2 --output-sync lint docs
-	$(BIN)/python -m pytest -n 2 --dist worksteal --order random $(FORKING)
-	$(BIN)/python -m pytest -n 2 --dist worksteal --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
+	$(MAKE) test-parts
+
+test-parts: .venv/.test
+	$(BIN)/python -m pytest -n 2 --dist worksteal --order random --extent $(EXTENT) $(FORKING)
+	$(BIN)/python -m pytest -n 2 --dist worksteal --order random --extent $(EXTENT) \
+	    $(addprefix --ignore=,$(FORKING) $(ELSEWHERE) $(PAGE_TESTS))
+
+test-thorough: .venv/.test
+	$(MAKE) test-parts EXTENT=thorough
 
 # One quick run of each study, from its command line to its figures, and of the benchmark.
 test-studies: .venv/.test .venv-bounds/.bounds
@@ -38,7 +47,7 @@ test-studies: .venv/.test .venv-bounds/.bounds
 	.venv-bounds/bin/python -m pytest tests/studies/test_bounds.py
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
-test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-language test-clients test-rllib test-wrappers test-browser test-clusters test-outside
+test-all: test test-thorough test-studies test-wheel test-oldest test-templates test-pythons test-language test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
 # The quickest of them, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \

@@ -12,6 +12,17 @@ collect_ignore = [
     *("battery_trl.py", "negotiation.py"),
 ]
 
+THOROUGH = ("branches", "event-driven", "experiments", "ledger", "seats")
+"""The pages whose examples plan, or run many episodes, for seconds."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
+def pytest_collection_modifyitems(items):
+    """Mark the examples of pages that take long."""
+    for item in items:
+        if item.path.parent.name in ("docs", "reference") and item.path.stem in THOROUGH:
+            item.add_marker(pytest.mark.thorough)
+
 
 @pytest.fixture(autouse=True)
 def _models_beside_the_page(request, monkeypatch):

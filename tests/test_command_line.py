@@ -48,6 +48,7 @@ def beside_the_models(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.thorough
 def test_command_check_finds_nothing_in_a_sound_simulation():
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}

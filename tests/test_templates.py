@@ -27,6 +27,7 @@ def run(folder, *arguments):
     return python(*arguments, cwd=folder, env={"PYTHONPATH": str(SOURCE)}, timeout=300)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_written_template_passes_its_own_tests(kind, tmp_path):
     done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
@@ -47,6 +48,7 @@ def test_a_written_template_passes_its_own_tests(kind, tmp_path):
     run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
 
 
+@pytest.mark.thorough
 def test_the_command_check_finds_a_written_template(tmp_path):
     assert main(["new", "plain", "water_tank", "--folder", str(tmp_path)]) == 0
     checked = run(tmp_path, "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
@@ -54,6 +56,7 @@ def test_the_command_check_finds_a_written_template(tmp_path):
 
 
 # plain needs Stable-Baselines3: tests/clients/test_templates.py
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])
 def test_template_training_beats_the_rule(kind, tmp_path):
     run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".")

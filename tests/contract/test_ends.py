@@ -109,6 +109,7 @@ def left(kind):
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
+@pytest.mark.thorough
 def test_thousands_of_aborted_episodes_leak_nothing():
     draw = random.Random(5)
     driver = Options.__init__.__kwdefaults__["driver"]

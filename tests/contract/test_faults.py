@@ -95,6 +95,7 @@ def play_and_cut_short(env):
     cut_short(env)
 
 
+@pytest.mark.thorough
 @everywhere(*VIEWS)
 def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
     before = stacks()
@@ -179,6 +180,7 @@ def test_error_note_names_decision_agent_and_seed(view, place, time, where, seed
 INSIDE = [place for place in faults.PLACES if place != "render"]  # which comes after the step
 
 
+@pytest.mark.thorough
 @everywhere(*VIEWS, faults.vector, faults.vector_of_joint, places=INSIDE)
 @pytest.mark.parametrize("method", ["step", "reset", "close"])
 def test_reentrant_use_is_refused_and_the_episode_continues(view, place, method):
@@ -270,6 +272,7 @@ def interrupt_at(number, function, *args):
     return where, raised
 
 
+@pytest.mark.thorough
 @EVERY_VIEW
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
     # In a process of its own: where greenlets were interrupted amid a switch, the collector may
@@ -321,6 +324,7 @@ USES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.greenlet("the release is the same with every driver")
 @pytest.mark.parametrize("use", USES)
 def test_interrupt_while_opening_or_closing_leaves_nothing_patched(use):

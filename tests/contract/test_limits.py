@@ -185,6 +185,7 @@ def test_step_timeout_does_not_change_results():
     assert str(logs[0]) == str(logs[1]) == str(logs[2])
 
 
+@pytest.mark.thorough
 def test_a_model_that_never_unwinds_is_given_up(monkeypatch):
     for place in ("hooks.limits", "core.switching.threads"):
         monkeypatch.setattr(f"simenv_marl.{place}.SECONDS_TO_UNWIND", 0.3)

@@ -345,6 +345,7 @@ def test_uncaught_errors_of_a_forked_model_in_a_thread_are_printed():
     assert "forked" in said
 
 
+@pytest.mark.thorough
 @DRIVERS
 @pytest.mark.parametrize(
     "where", ["suspended", "closed", "inside", "in a thread", "in daemons", "moving"]

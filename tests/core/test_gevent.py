@@ -49,6 +49,7 @@ RULED = """
 """The end of all: nobody is asked any more."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @pytest.mark.parametrize("first", ["user", "model"])
 @pytest.mark.parametrize("where", ["main", "spawned"])
@@ -80,6 +81,7 @@ def test_a_call_on_the_users_side_of_a_hub_runs_the_rule(where, first, driver):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("first", ["user", "model"])
 @pytest.mark.parametrize(
     "how",
@@ -179,6 +181,7 @@ PATCHED = """
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 def test_threads_that_gevent_has_replaced_are_refused(driver):
     told = run_code(f"driver = {driver!r}", PATCHED.format(""))

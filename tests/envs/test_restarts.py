@@ -167,6 +167,7 @@ def use_and_step(envs, use, actions):
     return envs.step(actions)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["nested", "masked", "dict action", "goal"])
 @pytest.mark.parametrize("use", ["step", "call", "set_attr", "reset", "partial reset"])
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
@@ -314,6 +315,7 @@ def test_restarts_need_workers():
         restarting(most_restarts=-1)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 @pytest.mark.parametrize("context", [FORK, "spawn"])
 def test_no_process_and_no_descriptor_is_left_behind(context):

@@ -68,6 +68,7 @@ def goes_on(envs, seed=0):
     assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     ("kind", "context"), [("masked", "spawn"), ("box", FORK), ("image", FORK), ("goal", FORK)]
@@ -93,6 +94,7 @@ def test_workers_share_simulations_evenly_and_none_is_idle():
         assert os.getpid() not in there
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
 def test_models_and_mappings_that_no_module_holds_are_sent_along(context):
     class Local(Counter):
@@ -267,6 +269,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("context", ["spawn", FORK])
 @pytest.mark.parametrize(
     ("end", "status"),
@@ -302,6 +305,7 @@ def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
     assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("error", ["OSError", "ZeroDivisionError", "WorkerError"])
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
@@ -335,6 +339,7 @@ def start_in_vain(error):
     assert descriptors() == before  # even while the error is kept
 
 
+@pytest.mark.thorough
 def test_a_script_without_a_main_guard_raises_an_error_that_names_it(tmp_path):
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
     (tmp_path / "script.py").write_text(text, encoding="utf-8")

@@ -46,6 +46,7 @@ def test_gymnasium_accepts_a_herd_as_one_agent():
     check_env(joint_env(meadow, possible_agents=herd, undeclared="rule"), skip_render_check=True)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_check_finds_nothing_in_an_example_whose_environments_pickle(name):
     simulation, points = EXAMPLES[name]

@@ -197,6 +197,7 @@ def test_questions_and_displays_describe_each_decision():
 # -- planning -------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_doctors_that_plan_are_not_worse_than_the_rule(capsys):
     found = plan.main(["--seeds", "3", "--first", "2", "--futures", "2", "--horizon", "45"])
     assert "standard error" in capsys.readouterr().out
@@ -204,6 +205,7 @@ def test_doctors_that_plan_are_not_worse_than_the_rule(capsys):
     assert row["difference_low"] <= 0  # costs
 
 
+@pytest.mark.thorough
 def test_simulate_and_evaluate_find_the_same_gain():
     seeds, options = [1], {"futures": 2, "horizon": 45.0}
     found = plan.compare(seeds, **options).summary(metric="cost")

@@ -46,6 +46,7 @@ def test_the_model_prints_its_years(capsys):
     assert "years a second" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
 def test_training_is_determined_by_its_seed(capsys):
     options = [
         "--clients",

@@ -59,6 +59,7 @@ def test_the_greenhouse_passes_gymnasiums_check(name, options):
     environment.close()
 
 
+@pytest.mark.thorough
 def test_training_is_worth_it():
     generations, seeds = 3, range(train.HELD_OUT, train.HELD_OUT + 8)
     # what searching finds

@@ -20,6 +20,7 @@ def told_of(model):
     return [cell.strip() for cell in line[0].strip("|").split("|")]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("example", mesa_models.EXAMPLES, ids=lambda example: example.__name__)
 def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
     if example is mesa_models.wolf_sheep and mesa_models.NEEDS_SIMULATOR:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from examples.queue_admission.env import AGENT, QueueSimulation, observation
 from examples.queue_admission.exact import ADMIT_ALL, DECISIONS, EMPTY, best_table, values, worth
 from examples.queue_admission.model import INTEREST
@@ -37,6 +38,7 @@ def test_discounting_by_decision_misses_the_optimum():
     assert round(worth(best_table(reward_rate=0.0)) / optimum, 3) == 0.776
 
 
+@pytest.mark.thorough
 def test_value_of_a_table_matches_its_returns_in_the_model():
     best, seeds = best_table(), range(300)
     gains = earned({AGENT: policy_of(best)}, seeds) - earned({}, seeds)

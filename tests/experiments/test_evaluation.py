@@ -195,6 +195,7 @@ def test_interval_is_nan_with_a_reason_where_none_can_be_computed(values, note, 
     assert note in why
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [5, 16])
 @pytest.mark.parametrize(
     ("name", "least"), [("normal", 0.93), ("lognormal", 0.78), ("0/1, p=0.5", 0.9)]

@@ -205,6 +205,7 @@ def test_other_definitions_are_warned_of(told, arguments, tmp_path):
     assert frame.equals(first.frame[same].reset_index(drop=True))
 
 
+@pytest.mark.thorough
 def test_equal_definitions_are_not_warned_of(tmp_path):
     run(tmp_path, lambda: Shop(2), workers=2, driver="thread")
     run(tmp_path, lambda: Shop(2), points=dict(reversed(POINTS.items())))
@@ -289,6 +290,7 @@ if __name__ == "__main__":
 """Forks a process for each line of its input, and prints its id and its exit code."""
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kills_lose_no_finished_episode_and_count_none_twice(workers, tmp_path):

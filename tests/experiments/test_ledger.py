@@ -216,6 +216,7 @@ def test_ledger_replaces_one_decision_by_the_rule_with_after_policy():
     assert found.frame["contribution"].tolist() == worth.tolist()
 
 
+@pytest.mark.thorough
 def test_ledger_ranks_planted_mistakes_among_the_worst():
     mistakes = set(range(5, 95, 9))
 
@@ -413,6 +414,7 @@ def test_each_legal_action_has_a_value():
     assert "prompt" not in decision_values(Dice, seeds=[1], points=dice(), futures=0)
 
 
+@pytest.mark.thorough
 def test_masked_actions_have_no_row_and_policies_play():
     warden = {"warden_0": boldest}
     found = decision_values(Fair, warden, seeds=[1, 3], points=FAIR_POINTS, futures=2)

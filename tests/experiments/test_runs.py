@@ -100,6 +100,7 @@ def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_pa
     assert "numpy" in provenance["dependencies"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -539,6 +540,7 @@ class Deadly(Shop):
         super().run()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("batched", [False, True])
 def test_run_that_kills_its_worker_becomes_an_error_row(batched, tmp_path):
     given = {"design": {"days": [1, 2, 3]}, "contenders": None, "batched": batched}
@@ -609,6 +611,7 @@ SCRIPT = """
 """Workers find what a script defines, and a model need not decide."""
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_killed_process_loses_only_the_runs_in_progress(workers, tmp_path):

@@ -97,6 +97,7 @@ RUNS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["fork", "replay"])
 @pytest.mark.parametrize("run", RUNS)
 def test_a_branch_in_a_planner_is_saved_and_goes_on(run, method, at_third, tmp_path):

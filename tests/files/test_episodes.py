@@ -55,6 +55,7 @@ def lines_of(path):
 # -- continuations --------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 def test_random_worlds_continue_alike_in_a_fresh_process():
     assert differing(80) == []

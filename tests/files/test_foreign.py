@@ -81,6 +81,7 @@ def go_on(folder, *given):
         env.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_saved_environments_continue_in_a_fresh_process(name, tmp_path):
@@ -89,6 +90,7 @@ def test_saved_environments_continue_in_a_fresh_process(name, tmp_path):
     alone(go_on, str(tmp_path))
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", SIMULATIONS)
 def test_saved_simulations_continue_in_a_fresh_process(name, tmp_path):
@@ -115,6 +117,7 @@ def process_of(name):
     return {"simulation": getattr(import_module(module), attribute)()}
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", PROCESSES)
 def test_saved_models_outside_python_continue_in_a_fresh_process(name, tmp_path):
@@ -139,6 +142,7 @@ def arguments_of(name):
     return {"simulation": mesa_models.stepped(model), "points": points, **options}
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 def test_saved_mesa_models_continue_in_a_fresh_process(tmp_path):
     mesa_models = imported("examples.mesa_models")

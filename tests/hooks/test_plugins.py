@@ -820,6 +820,7 @@ def test_handlers_run_around_the_decision(where):
     env.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(8))
 def test_environments_and_handlers_may_open_and_close_in_any_order(seed):
     random, live, log = Random(seed), [], []

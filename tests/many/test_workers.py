@@ -93,6 +93,7 @@ def test_workers_collect_the_same_episodes():
         assert same(vars(found), vars(shared[key]))
 
 
+@pytest.mark.thorough
 def test_functions_that_are_defined_anywhere_reach_the_workers():
     """Functions without an importable name work in workers: local, differences, handlers."""
 
@@ -296,6 +297,7 @@ def test_simulations_without_decisions_are_collected_in_order(seeds):
     assert found[ant].episodes.tolist() == ([5] if 5 in seeds else [])
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 @pytest.mark.parametrize("what", ["it cannot be started", "it ends"])
 def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
@@ -392,6 +394,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "definition",
     [
@@ -470,6 +473,7 @@ def seed_of(simulation):
     return simulation.own_seed
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("batch_size", [1, 1024])
 def test_lost_runs_are_run_again_once_each_alone(batch_size, tmp_path):

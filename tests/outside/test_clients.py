@@ -496,6 +496,7 @@ ANSWERS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("client", "line"),
     [("C++", line) for line in ANSWERS]

@@ -75,6 +75,7 @@ def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
     return env
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", IN_MID_EPISODE)
 def test_faults_in_mid_episode_are_errors(make_env, what):
     kind, text = IN_MID_EPISODE[what]

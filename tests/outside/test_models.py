@@ -119,6 +119,7 @@ def environment(command):
     return names
 
 
+@pytest.mark.thorough
 @needs("town")
 def test_the_code_of_the_page_on_java(here, capsys):
     (here / "Ferries.java").write_text(shown("java")[0])
@@ -135,6 +136,7 @@ def test_the_code_of_the_page_on_java(here, capsys):
     assert check_wire(command).ok
 
 
+@pytest.mark.thorough
 @needs("town")
 def test_the_code_of_the_page_on_the_town(capsys):
     names = {"__name__": "__main__"}
@@ -158,6 +160,7 @@ def test_the_code_of_the_page_on_python(here, capsys):
     }, str(report)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(
     COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed"
 )

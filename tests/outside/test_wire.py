@@ -166,6 +166,7 @@ HELLO, EPISODE, TWO = (
 STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "other decisions at "
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("change", "tried", "text"),
     [

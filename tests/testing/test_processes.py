@@ -2,6 +2,8 @@
 
 import threading
 
+import pytest
+
 from simenv_marl.testing import check_simulation
 from tests.processes import python
 from tests.worlds.copied import (
@@ -18,6 +20,7 @@ def checked(simulation, **changes):
     return check_simulation(simulation, walk_points(simulation, **changes), episodes=2, seeds=[4])
 
 
+@pytest.mark.thorough
 def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
     for model in (UnorderedWalk, NotedWalk, HashedWalk):
         (seen,) = checked(model).of("error")
@@ -26,6 +29,7 @@ def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
         assert "seed 4" in seen.evidence
 
 
+@pytest.mark.thorough
 def test_check_accepts_sorted_sets():
     report = checked(OrderedWalk)
     assert not report.of("error")

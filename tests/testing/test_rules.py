@@ -473,6 +473,7 @@ class Broken(Walk):
         self.place /= 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), WALKS)
 def test_check_reports_each_fault_with_its_place(model, changes, options, severity, words, told):
     report_with(model, changes, options, severity, words, told)

@@ -119,6 +119,7 @@ def test_check_finds_nothing_in_sound_points_of_all_kinds():
 COLONY = entities.ColonyDesign(initial=4, most=10, ticks=6, overseen="before")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("simulation", "points"),
     [
@@ -413,6 +414,7 @@ class Seeding(Global):
         random.seed(seed)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
 def test_faults_of_models_are_found(model, changes, options, severity, words, told):
     report, seen = report_with(model, changes, options, severity, words, told)

@@ -58,7 +58,7 @@ def agrees(env, reference):
 
 @given(world_designs(), seeds, answers)
 @settings(max_examples=300)
-def test_random_episodes_match_a_reference_implementation(design, seed, given_answers):
+def test_aec_env_matches_a_reference_implementation_of_random_models(design, seed, given_answers):
     """Also the rewards that each step books: none is lost or counted twice."""
     env = made(design)
     booked = {}

@@ -68,7 +68,7 @@ def compared(aec, turn, seed, action_of):
 
 @given(random_worlds.yard_designs, random_worlds.seeds)
 @settings(max_examples=60)
-def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
+def test_turn_env_with_births_and_deaths_matches_aec_env(design, seed):
     options = {"possible_agents": random_worlds.YARD_ROSTER}
     compared(
         aec_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
@@ -80,7 +80,7 @@ def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
 
 @given(random_worlds.world_designs(), random_worlds.seeds, random_worlds.answers)
 @settings(max_examples=100)
-def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
+def test_turn_env_matches_aec_env_in_random_models(design, seed, answers):
     points = random_worlds.points_of(design)
     policies = {points[point]: random_worlds.world_policy for point in design.policies} | {
         points[point]: RULE for point in design.rules
@@ -100,7 +100,7 @@ def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
 # -- spaces ---------------------------------------------------------------------------------------
 
 
-def test_turn_observation_adds_kind_and_index_of_the_agent():
+def test_turn_env_observation_adds_kind_and_index_of_the_agent():
     ant = decision(agent=lambda: "ant_1")
     bee = decision(agent="bee_0", observation_space_mapping=lambda: [3.0, 4.0])
     env = turn_env(calling(ant, bee), [ant, bee])
@@ -125,7 +125,7 @@ def test_turn_observation_adds_kind_and_index_of_the_agent():
     assert observation.tolist() == [*one_hot(2, 3), *one_hot(1, 2), 3.0, 4.0]
 
 
-def test_different_observations_are_flattened_and_padded_with_zeros():
+def test_turn_env_flattens_different_observations_and_pads_with_zeros():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Discrete(3),
@@ -152,7 +152,7 @@ def test_different_observations_are_flattened_and_padded_with_zeros():
         turn_env(calling(ant, text), [ant, text])
 
 
-def test_discrete_actions_of_a_turn_view_share_one_masked_space():
+def test_turn_env_unites_discrete_actions_in_one_masked_space():
     mask = np.array([0, 1], np.int8)
     ant = decision(
         agent="ant_0", action_space=spaces.Discrete(2, start=5), action_mask_mapping=lambda: mask
@@ -174,7 +174,7 @@ def test_discrete_actions_of_a_turn_view_share_one_masked_space():
     assert env.simulation.log == [6, 3]
 
 
-def test_box_actions_of_a_turn_view_are_scaled_to_each_agents_bounds():
+def test_turn_env_scales_box_actions_to_each_agents_bounds():
     ant = decision(agent="ant_0", **vector(0, 10))
     bee = decision(agent="bee_0", **vector(-1, 3, 2))
     whole = decision(
@@ -201,7 +201,7 @@ def test_box_actions_of_a_turn_view_are_scaled_to_each_agents_bounds():
         turn_env(calling(ant, unbounded), [ant, unbounded])
 
 
-def test_discrete_actions_beside_boxes_are_chosen_by_preference():
+def test_turn_env_chooses_discrete_actions_beside_boxes_by_largest_value():
     mask = np.array([1, 0, 1], np.int8)
     ant = decision(
         agent="ant_0",
@@ -227,7 +227,7 @@ def test_discrete_actions_beside_boxes_are_chosen_by_preference():
 # -- rewards, infos, ends -------------------------------------------------------------------------
 
 
-def test_elapsed_times_and_discounts_count_from_the_last_step():
+def test_turn_env_elapsed_time_and_discount_count_from_the_last_step():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def main(simulation):
@@ -242,7 +242,7 @@ def test_elapsed_times_and_discounts_count_from_the_last_step():
     assert infos[1]["discount"] == pytest.approx(math.exp(-1))
 
 
-def test_the_last_observation_is_that_of_the_agent_that_decided_last():
+def test_turn_env_last_observation_is_of_the_agent_that_decided_last():
     level = [0]
 
     def main(simulation):
@@ -264,7 +264,7 @@ def test_the_last_observation_is_that_of_the_agent_that_decided_last():
         env.step(1)
 
 
-def test_clone_of_a_turn_view_continues_like_the_original():
+def test_clone_of_turn_env_continues_like_the_original():
     design = random_worlds.YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
     env = turn_env(
         lambda: random_worlds.Yard(design),
@@ -294,7 +294,7 @@ def test_clone_of_a_turn_view_continues_like_the_original():
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_turn_view_passes_check_env_and_works_in_vectors(flatten):
+def test_turn_env_passes_check_env_and_works_in_vector_env(flatten):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **vector(0, 1))
     options = {"flatten": flatten}
     check_env(turn_env(calling(ant, bee, ant), [ant, bee], **options), skip_render_check=True)
@@ -315,7 +315,7 @@ def test_turn_view_passes_check_env_and_works_in_vectors(flatten):
     vectors.close()
 
 
-def test_infos_of_the_turn_view_contain_states_on_request():
+def test_turn_env_infos_contain_the_state_on_request():
     class Counting:
         def reset(self):
             self.count = 0

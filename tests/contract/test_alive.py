@@ -391,7 +391,7 @@ def test_last_observation_shows_later_changes_of_a_set_argument():
 
 
 @pytest.mark.parametrize("kind", [list, set, dict.fromkeys])
-def test_agent_keeps_its_last_observation_if_its_argument_is_emptied(kind):
+def test_last_observation_stays_if_the_model_empties_a_list_argument(kind):
     class Shop(SimulationInterface):
         def reset(self, seed=None):
             self.jobs = kind(["mill", "drill"])

@@ -450,7 +450,7 @@ def test_simulate_many_runs_more_simulations_at_once_if_policies_are_slow(monkey
     assert crowd(1.0)[:4] == [4, 8, 16, 32]
 
 
-def test_batch_functions_share_their_default_options():
+def test_simulate_many_collect_episodes_and_evaluate_share_their_defaults():
     expected = {"batch_size": 1024, "concurrency": 64, "workers": 0, "progress": False}
     for function in (simulate_many, collect_episodes, evaluate, run_experiment):
         parameters = inspect.signature(function).parameters

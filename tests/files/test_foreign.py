@@ -100,7 +100,7 @@ def test_saved_episodes_of_example_models_continue_in_a_fresh_process(name, tmp_
     alone(go_on, str(tmp_path))
 
 
-def test_saved_episodes_of_models_with_arguments_continue_elsewhere(tmp_path):
+def test_saved_episodes_of_models_with_arguments_continue_in_a_new_process(tmp_path):
     sheep = imported("examples.wolf_sheep.env")
     meadow = partial(sheep.Meadow, 25, width=8, height=8, initial_sheep=20, initial_wolves=5)
     save(aec_env(meadow), tmp_path, "own points")
@@ -117,7 +117,7 @@ def process_of(name):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", PROCESSES)
-def test_saved_episodes_of_models_outside_python_continue_elsewhere(name, tmp_path):
+def test_saved_episodes_of_models_outside_python_continue_in_a_new_process(name, tmp_path):
     problem = getattr(imported(PROCESSES[name][0]), "missing", str)()
     if problem:
         pytest.skip(problem)

@@ -50,7 +50,7 @@ def test_episode_file_saves_module_level_objects_by_name(thing):
 
 
 @pytest.mark.parametrize("thing", [Holder().method, lambda: 1, Holder(), partial(Holder)])
-def test_episode_file_has_no_name_for_objects_outside_modules(thing):
+def test_save_episode_finds_no_name_for_objects_that_no_module_contains(thing):
     assert names_of([thing]) == {}
 
 

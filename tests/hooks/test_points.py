@@ -434,7 +434,7 @@ def test_points_can_be_keyed_by_functions_while_other_envs_are_alive():
 
 
 @pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
-def test_env_checks_every_reward_with_or_without_difference(others, monkeypatch):
+def test_env_checks_every_reward_even_if_difference_is_not_used(others, monkeypatch):
     monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", others)
     rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
     decide = decision(reward_mapping=lambda: next(rewards))

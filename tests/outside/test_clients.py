@@ -268,7 +268,7 @@ def test_client_libraries_let_a_model_truncate_its_episode(child):
     assert child.begin(play="none") == ended()
 
 
-def test_client_libraries_allow_decisions_within_an_unreported_rule(client):
+def test_client_libraries_allow_a_decision_inside_a_rule_not_reported(client):
     with Child(*client.command, NESTED="1") as child:
         assert sorted(child.receive()["can"]) == ["expect", "reseed"]
         frames = child.begin(play="nested"), child.rule(1)
@@ -279,7 +279,7 @@ def test_client_libraries_allow_decisions_within_an_unreported_rule(client):
         assert child.act(2, 6) == ended(60)
 
 
-def test_client_libraries_refuse_decisions_within_a_reported_rule(child):
+def test_client_libraries_refuse_a_decision_inside_a_rule_that_is_reported(child):
     child.begin(play="nested")
     text = child.rule(1)["error"]["text"]
     assert re.match("the rule of a has asked for a decision.*report_?[rR]ules", text)

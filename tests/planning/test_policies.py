@@ -124,7 +124,7 @@ def test_rollout_policy_tries_actions_of_a_round_in_the_same_futures(wide):
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_planning_policies_decide_in_simulate_as_by_hand(driver, key, method):
+def test_planning_policies_in_simulate_choose_the_actions_of_a_reference(driver, key, method):
     policy = planner(method=None if driver == "thread" and method == "fork" else method)
     found = simulate(Duel, {key: policy}, points=tame(), seed=5, driver=driver)
     answers, value = by_hand()
@@ -134,7 +134,7 @@ def test_planning_policies_decide_in_simulate_as_by_hand(driver, key, method):
 
 @METHODS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env, turn_env])
-def test_planning_policies_decide_in_envs_as_by_hand(make, method):
+def test_planning_policies_in_envs_choose_the_best_actions_of_a_reference(make, method):
     env = begun(make(Duel, tame(), policies={"left": planner(method=method)}))
     while not step(env, 1, "right"):
         pass

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from simenv_marl import save_episode
 from simenv_marl.__main__ import main
+from tests.worlds.saved import mid_episode
 
 MODELS = '''
 """Two walks, one of which limps."""
@@ -160,9 +162,7 @@ def test_commands_refuse_invalid_numbers(command, options, capsys):
 
 
 def test_replay_command_shows_an_episode_file_up_to_a_decision(capsys):
-    from tests.files.test_episodes import begun, save_episode
-
-    env = begun(taken=5)
+    env = mid_episode(taken=5)
     save_episode(env, "episode")
     assert main(["replay", "episode"]) == 0
     head, *decisions, now = capsys.readouterr().out.splitlines()

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given, settings
 
-from simenv_marl import RULE, aec_env
+from simenv_marl import aec_env
 from simenv_marl.errors import EpisodeOverError
 from tests.worlds.models import play
 from tests.worlds.random_worlds import (
@@ -14,18 +14,16 @@ from tests.worlds.random_worlds import (
     points_of,
     seeds,
     world_designs,
-    world_policy,
+    world_policies,
 )
 
 
 def made(design):
     """An environment of a design."""
     points = points_of(design)
-    policies = {points[point]: world_policy for point in design.policies} | {
-        points[point]: RULE for point in design.rules
-    }
+    policies = world_policies(design, points)
     return aec_env(
-        lambda: World(design, points), points, policies=policies or None, max_steps=design.max_steps
+        lambda: World(design, points), points, policies=policies, max_steps=design.max_steps
     )
 
 

@@ -10,8 +10,22 @@ from hypothesis import given, settings
 
 from simenv_marl import RULE, aec_env, clone, generate_env, turn_env, vector_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError, UnknownOptionError, ViewError
-from tests.worlds import random_worlds
 from tests.worlds.models import Timed, calling, decision, script
+from tests.worlds.random_worlds import (
+    YARD_POINTS,
+    YARD_ROSTER,
+    World,
+    Yard,
+    YardDesign,
+    answers,
+    legal,
+    points_of,
+    seeds,
+    world_designs,
+    world_policies,
+    yard_designs,
+    yard_policy,
+)
 
 
 def vector(low, high, size=1):
@@ -66,33 +80,30 @@ def compared(aec, turn, seed, action_of):
     turn.close()
 
 
-@given(random_worlds.yard_designs, random_worlds.seeds)
+@given(yard_designs, seeds)
 @settings(max_examples=60)
 def test_turn_env_with_births_and_deaths_matches_aec_env(design, seed):
-    options = {"possible_agents": random_worlds.YARD_ROSTER}
+    options = {"possible_agents": YARD_ROSTER}
     compared(
-        aec_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
-        turn_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
+        aec_env(lambda: Yard(design), YARD_POINTS, **options),
+        turn_env(lambda: Yard(design), YARD_POINTS, **options),
         seed,
-        lambda observation, info: random_worlds.yard_policy(observation),
+        lambda observation, info: yard_policy(observation),
     )
 
 
-@given(random_worlds.world_designs(), random_worlds.seeds, random_worlds.answers)
+@given(world_designs(), seeds, answers)
 @settings(max_examples=100)
-def test_turn_env_matches_aec_env_in_random_models(design, seed, answers):
-    points = random_worlds.points_of(design)
-    policies = {points[point]: random_worlds.world_policy for point in design.policies} | {
-        points[point]: RULE for point in design.rules
-    }
-    options = {"policies": policies or None, "max_steps": design.max_steps}
-    given_answers = iter(answers)
+def test_turn_env_matches_aec_env_in_random_models(design, seed, given_answers):
+    points = points_of(design)
+    options = {"policies": world_policies(design, points), "max_steps": design.max_steps}
+    remaining = iter(given_answers)
     compared(
-        aec_env(lambda: random_worlds.World(design, points), points, **options),
-        turn_env(lambda: random_worlds.World(design, points), points, **options),
+        aec_env(lambda: World(design, points), points, **options),
+        turn_env(lambda: World(design, points), points, **options),
         seed,
-        lambda observation, info: random_worlds.legal(
-            next(given_answers), {k: v for k, v in info.items() if k == "action_mask"}
+        lambda observation, info: legal(
+            next(remaining), {k: v for k, v in info.items() if k == "action_mask"}
         ),
     )
 
@@ -265,11 +276,11 @@ def test_turn_env_last_observation_is_of_the_agent_that_decided_last():
 
 
 def test_clone_of_turn_env_continues_like_the_original():
-    design = random_worlds.YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
+    design = YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
     env = turn_env(
-        lambda: random_worlds.Yard(design),
-        random_worlds.YARD_POINTS,
-        possible_agents=random_worlds.YARD_ROSTER,
+        lambda: Yard(design),
+        YARD_POINTS,
+        possible_agents=YARD_ROSTER,
     )
     env.reset(seed=5)
     env.step(2)

@@ -2,7 +2,6 @@
 
 import json
 import os
-from functools import partial
 
 import numpy as np
 import pytest
@@ -33,19 +32,7 @@ from simenv_marl.planning import RolloutPolicy
 from tests.processes import python
 from tests.worlds import saved
 from tests.worlds.random_worlds import YARD_POINTS, yard_outcome
-from tests.worlds.saved import Pumps, differing, future, move, steady, yard
-
-YARD = partial(yard, 3, 2, 2, 2, 3, None)
-
-
-def begun(make=aec_env, simulation=YARD, points=YARD_POINTS, *, taken=6, seed=7, **options):
-    """Return an environment after some steps."""
-    env = make(simulation, points, **options)
-    env.reset(seed=seed)
-    chance = saved.random.Random(1)
-    for _ in range(taken):
-        move(env, chance)
-    return env
+from tests.worlds.saved import YARD, Pumps, differing, future, mid_episode, steady
 
 
 def lines_of(path):
@@ -68,7 +55,7 @@ def test_command_of_saved_worlds_prints_how_many_continuations_differ(kind):
 @pytest.mark.parametrize("make", [aec_env, parallel_env, turn_env])
 @pytest.mark.parametrize("method", ["fork", "replay"])
 def test_save_episode_of_a_clone_equals_that_of_its_original(make, method, tmp_path):
-    env = begun(make)
+    env = mid_episode(make)
     with_seed = clone(env, method=method)
     for path, each in ((tmp_path / "env", env), (tmp_path / "clone", with_seed)):
         save_episode(each, path)
@@ -86,7 +73,7 @@ class Reseeded(Pumps):
 
 
 def test_save_episode_of_a_reseeded_clone_keeps_its_seed(tmp_path):
-    env = begun(single_env, Reseeded, agent="push", taken=3, points=None)
+    env = mid_episode(single_env, Reseeded, agent="push", taken=3, points=None)
     other = clone(env, seed=5)
     other.step(RULE)
     save_episode(other, tmp_path / "a")
@@ -95,7 +82,7 @@ def test_save_episode_of_a_reseeded_clone_keeps_its_seed(tmp_path):
 
 
 def test_save_episode_works_in_a_branch(tmp_path):
-    env = begun()
+    env = mid_episode()
 
     def save(continuation, number):
         continuation.step(RULE)
@@ -107,7 +94,7 @@ def test_save_episode_works_in_a_branch(tmp_path):
 
 
 def test_load_episode_restores_policies_for_later_decisions(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", policies={"pull": steady})
+    env = mid_episode(single_env, Pumps, points=None, agent="push", policies={"pull": steady})
     save_episode(env, tmp_path / "a")
     assert [line.get("by") for line in lines_of(tmp_path / "a")[1:4]] == [None, "policy", None]
     loaded = load_episode(tmp_path / "a")
@@ -149,7 +136,7 @@ def test_env_latest_is_the_result_of_the_last_reset_or_step(make, tmp_path):
 
 
 def test_episode_files_store_plugins_by_name(tmp_path):
-    env = begun(plugins=[(twice, f"{POINTS_OF}.Yard.plan", "after")])
+    env = mid_episode(plugins=[(twice, f"{POINTS_OF}.Yard.plan", "after")])
     save_episode(env, tmp_path / "a")
     loaded = load_episode(tmp_path / "a")
     assert loaded.unwrapped.plugins == env.unwrapped.plugins
@@ -164,7 +151,7 @@ def twice(yard, _result):
 
 
 def test_episode_files_store_float32_actions_exactly(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", taken=0)
+    env = mid_episode(single_env, Pumps, points=None, agent="push", taken=0)
     env.step(np.array([0.1, -1 / 3], np.float32))
     env.step(np.array([1, 0], np.float32))
     save_episode(env, tmp_path / "a")
@@ -174,7 +161,7 @@ def test_episode_files_store_float32_actions_exactly(tmp_path):
 
 
 def test_episode_file_is_small(tmp_path):
-    env = begun(taken=0)
+    env = mid_episode(taken=0)
     for _ in range(30):
         env.step(None if env.terminations[env.agent_selection] else 3)
     save_episode(env, tmp_path / "a")
@@ -211,7 +198,7 @@ def test_save_episode_refuses_unnamed_objects_unless_they_are_given_later(
 def test_load_episode_takes_simulations_and_points_without_a_name(tmp_path):
     points = {name: YARD_POINTS[name] for name in YARD_POINTS}
     made = saved.Yard(saved.YardDesign(3, 2, 2, 2, 3, None))
-    env = begun(simulation=made, points=points)
+    env = mid_episode(simulation=made, points=points)
     with pytest.raises(EpisodeFileError, match="the simulation: <"):
         save_episode(env, tmp_path / "a")
     save_episode(env, tmp_path / "a", unnamed=True)
@@ -222,7 +209,7 @@ def test_load_episode_takes_simulations_and_points_without_a_name(tmp_path):
 
 def test_save_episode_refuses_a_definition_that_no_module_contains(tmp_path):
     points = {name: saved.define_again() for name in list(YARD_POINTS)[:1]}
-    env = begun(points=points, taken=1)
+    env = mid_episode(points=points, taken=1)
     with pytest.raises(EpisodeFileError, match=r"the definition of .*Yard\.plan"):
         save_episode(env, tmp_path / "a")
     save_episode(env, tmp_path / "a", unnamed=True)
@@ -247,7 +234,7 @@ def test_save_episode_refuses_envs_without_a_single_episode(tmp_path):
             found.append(error)
         return 1
 
-    begun(policies={"planner": plan}, taken=1)
+    mid_episode(policies={"planner": plan}, taken=1)
     assert found
 
 
@@ -263,7 +250,7 @@ class Forgetful(Pumps):
 
 
 def test_save_episode_refuses_a_model_that_does_not_repeat_itself(tmp_path):
-    env = begun(simulation=Forgetful, points=None)
+    env = mid_episode(simulation=Forgetful, points=None)
     with pytest.raises(EpisodeFileError, match="does not repeat the episode"):
         save_episode(env, tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
@@ -278,7 +265,7 @@ def test_save_episode_refuses_reset_options_that_are_no_json(tmp_path):
 
 def test_episode_file_errors_name_files_that_cannot_be_opened(tmp_path):
     with pytest.raises(StoreError, match="nowhere"):
-        save_episode(begun(), tmp_path / "nowhere" / "a")
+        save_episode(mid_episode(), tmp_path / "nowhere" / "a")
     with pytest.raises(StoreError, match="nowhere"):
         load_episode(tmp_path / "nowhere")
 
@@ -312,7 +299,7 @@ def changed(path, number, change):
 def test_load_episode_error_names_the_first_decision_that_differs(
     number, change, problem, tmp_path
 ):
-    save_episode(begun(), tmp_path / "a")
+    save_episode(mid_episode(), tmp_path / "a")
     changed(tmp_path / "a", number, lambda line: line.update(change))
     with pytest.raises(EpisodeFileError, match=problem) as caught:
         load_episode(tmp_path / "a")
@@ -320,7 +307,7 @@ def test_load_episode_error_names_the_first_decision_that_differs(
 
 
 def test_load_episode_error_names_other_package_versions(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+    save_episode(mid_episode(), tmp_path / "a")
     changed(tmp_path / "a", 0, lambda line: line["versions"].update(numpy="1.0", lost="2.0"))
     changed(tmp_path / "a", 3, lambda line: line.update(seen=""))
     with pytest.raises(EpisodeFileError, match=r"numpy was 1\.0, and is .*; lost was 2\.0, and is"):
@@ -328,14 +315,14 @@ def test_load_episode_error_names_other_package_versions(tmp_path):
 
 
 def test_load_episode_refuses_an_episode_that_ends_earlier_than_saved(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", taken=12)
+    env = mid_episode(single_env, Pumps, points=None, agent="push", taken=12)
     save_episode(env, tmp_path / "a")
     with pytest.raises(EpisodeFileError, match=r"line 5.*the episode is over"):
         load_episode(tmp_path / "a", max_steps=3)
 
 
 def test_load_episode_options_replace_the_options_of_the_file(tmp_path):
-    save_episode(begun(driver="thread"), tmp_path / "a")
+    save_episode(mid_episode(driver="thread"), tmp_path / "a")
     assert load_episode(tmp_path / "a").unwrapped.driver == "thread"
     assert load_episode(tmp_path / "a", driver="greenlet").unwrapped.driver == "greenlet"
 
@@ -381,11 +368,11 @@ def test_episode_file_after_an_error_leads_to_the_decision_before_it(tmp_path):
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
 def test_recorded_episode_file_is_the_beginning_of_the_saved_file(make, tmp_path):
-    env = begun(make, Pumps, points=None, record=tmp_path / "all")
+    env = mid_episode(make, Pumps, points=None, record=tmp_path / "all")
     save_episode(env, tmp_path / "saved")
     [path] = (tmp_path / "all").iterdir()
     grown = path.read_text()
-    other = begun(make, Pumps, points=None)
+    other = mid_episode(make, Pumps, points=None)
     save_episode(other, tmp_path / "other")
     assert (tmp_path / "saved").read_text() == (tmp_path / "other").read_text()
     assert (tmp_path / "other").read_text().startswith(grown)
@@ -425,7 +412,7 @@ def test_record_all_keeps_the_episode_file_of_every_episode(tmp_path):
 
 
 def test_clones_and_branches_do_not_write_into_the_recorded_file(tmp_path):
-    env = begun(record=tmp_path)
+    env = mid_episode(record=tmp_path)
     [path] = tmp_path.iterdir()
     before = path.read_text()
     for method in ("fork", "replay"):
@@ -458,25 +445,25 @@ def test_record_refuses_unnamed_objects_when_the_env_is_made(tmp_path):
 def test_recorded_file_of_a_killed_process_can_be_loaded_and_continued(tmp_path):
     code = f"""
 import os
-from tests.files.test_episodes import begun
-env = begun(record={str(tmp_path)!r}, taken=9)
+from tests.worlds.saved import mid_episode
+env = mid_episode(record={str(tmp_path)!r}, taken=9)
 os.kill(os.getpid(), 9)
 """
     python("-c", code, status=-9)
     [path] = tmp_path.iterdir()
-    env = begun(taken=9)
+    env = mid_episode(taken=9)
     assert future(load_episode(path), 3) == future(env, 3)
 
 
 @pytest.mark.parametrize("left", [1, 5, 40])
 def test_torn_last_line_of_an_episode_file_loses_one_decision(left, tmp_path):
-    env = begun(record=tmp_path, taken=9)
+    env = mid_episode(record=tmp_path, taken=9)
     [path] = tmp_path.iterdir()
     written = path.read_bytes()
     last = written.splitlines()[-1]
     env.close()
     path.write_bytes(written[: -len(last) + left - 1])
-    assert future(load_episode(path), 3) == future(begun(taken=8), 3)
+    assert future(load_episode(path), 3) == future(mid_episode(taken=8), 3)
 
 
 def test_recorded_file_of_a_killed_model_loads_before_the_failing_step(tmp_path):
@@ -489,7 +476,7 @@ def test_recorded_file_of_a_killed_model_loads_before_the_failing_step(tmp_path)
 
 @pytest.mark.filterwarnings("ignore:yard cannot draw")
 def test_save_episode_works_with_a_planning_policy_that_branches(tmp_path):
-    env = begun(policies={"planner": PLANNER}, taken=2)
+    env = mid_episode(policies={"planner": PLANNER}, taken=2)
     save_episode(env, tmp_path / "a")
     assert future(load_episode(tmp_path / "a"), 3) == future(env, 3)
 
@@ -499,7 +486,7 @@ PLANNER = RolloutPolicy([1, 2], futures=1, horizon=1, method="replay")
 
 @pytest.mark.filterwarnings("ignore:yard cannot draw")
 def test_planning_policies_do_not_change_the_files_of_later_episodes(tmp_path):
-    env = begun(policies={"planner": PLANNER}, taken=2, record=tmp_path)
+    env = mid_episode(policies={"planner": PLANNER}, taken=2, record=tmp_path)
     env.reset(seed=2)
     env.step(RULE)
     [path] = tmp_path.iterdir()
@@ -538,7 +525,7 @@ def test_save_episode_works_with_record_all(tmp_path):
 
 
 def test_loaded_episode_is_recorded_again(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+    save_episode(mid_episode(), tmp_path / "a")
     loaded = load_episode(tmp_path / "a", record=tmp_path / "b")
     loaded.step(RULE)
     [path] = (tmp_path / "b").iterdir()

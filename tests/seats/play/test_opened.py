@@ -19,21 +19,20 @@ from simenv_marl.errors import EpisodeFileError
 from simenv_marl.seats.play.host import Rules
 from simenv_marl.seats.play.start import open_game
 from tests.files.test_episodes import Reseeded
-from tests.worlds import saved
 from tests.worlds.random_worlds import HERE as YARDS
 from tests.worlds.random_worlds import YARD_POINTS, Yard, yard_outcome, yard_policy
-from tests.worlds.saved import VANS, Depot, Pumps, cases, move, pushing, save, steady
-
-YARD = saved.partial(saved.yard, 3, 2, 2, 2, 3, None)
-
-
-def begun(make, simulation, points, taken=6, **options):
-    env = make(simulation, points, **options)
-    env.reset(seed=7)
-    chance = random.Random(1)
-    for _ in range(taken):
-        move(env, chance)
-    return env
+from tests.worlds.saved import (
+    VANS,
+    YARD,
+    Depot,
+    Pumps,
+    cases,
+    mid_episode,
+    move,
+    pushing,
+    save,
+    steady,
+)
 
 
 def open_at(path, until=None):
@@ -68,7 +67,7 @@ def state_of(simulation):
     ],
 )
 def test_play_opens_an_episode_file_at_its_decision(make, simulation, points, options, tmp_path):
-    env = begun(make, simulation, points, **options)
+    env = mid_episode(make, simulation, points, **options)
     save_episode(env, tmp_path / "a")
     game = open_at(tmp_path / "a")
     pending = env.unwrapped.episode.pending
@@ -82,9 +81,9 @@ def test_play_opens_an_episode_file_at_its_decision(make, simulation, points, op
 
 
 def test_play_opens_an_episode_file_after_a_given_number_of_decisions(tmp_path):
-    save_episode(begun(aec_env, YARD, YARD_POINTS), tmp_path / "a")
+    save_episode(mid_episode(), tmp_path / "a")
     game = open_at(tmp_path / "a", until=3)
-    env = begun(aec_env, YARD, YARD_POINTS, taken=3)
+    env = mid_episode(taken=3)
     assert (game.turn, game.now["agent"]) == (3, env.agent_selection)
     assert state_of(game.root.simulation) == state_of(env.simulation)
     game.close()
@@ -92,7 +91,7 @@ def test_play_opens_an_episode_file_after_a_given_number_of_decisions(tmp_path):
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
 def test_play_opens_a_finished_episode_file_at_its_end(make, tmp_path):
-    env = begun(make, Pumps, None, taken=0)
+    env = mid_episode(make, Pumps, None, taken=0)
     while not env.unwrapped.episode.over:
         move(env, random.Random(1))
     save_episode(env, tmp_path / "a")
@@ -116,7 +115,7 @@ def test_play_keeps_the_reset_options_of_an_opened_file(tmp_path):
 
 
 def test_play_refuses_the_episode_file_of_a_reseeded_clone(tmp_path):
-    env = begun(aec_env, Reseeded, None, taken=2)
+    env = mid_episode(aec_env, Reseeded, None, taken=2)
     save_episode(clone(env, seed=5), tmp_path / "a")
     with pytest.raises(EpisodeFileError, match="drawn anew"):
         open_at(tmp_path / "a")

@@ -395,7 +395,7 @@ def test_python_exits_cleanly_with_envs_in_mid_episode(driver, where):
 
 @DRIVERS
 @pytest.mark.parametrize(("end", "status"), [("sys.exit(3)", 3), ("os._exit(4)", 4)])
-def test_model_can_end_the_process_with_sys_exit(driver, end, status):
+def test_model_can_end_the_python_process(driver, end, status):
     said = run(
         f"""
         def main(simulation):

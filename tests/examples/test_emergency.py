@@ -210,7 +210,7 @@ def test_emergency_simulate_and_evaluate_find_the_same_gain():
     assert plan.gains(seeds, **options) == [pytest.approx(-found["difference"]["doctors plan"])]
 
 
-def test_emergency_planning_does_not_foresee_treatments():
+def test_emergency_reseed_draws_new_treatments_of_waiting_patients():
     def work(seed):
         simulation = EmergencySimulation()
         simulation.reset(seed=1)

@@ -157,7 +157,7 @@ def test_ledger_can_use_a_metric_or_team_reward_in_place_of_rewards():
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
-def test_ledger_copies_the_global_generators(driver):
+def test_ledger_futures_use_copies_of_the_global_generators(driver):
     class Thrown(Dice):
         reseed = None
 

@@ -518,7 +518,7 @@ def test_run_experiment_keeps_definitions_of_each_row_separate(arguments, tmp_pa
     assert frame["metric"].tolist() == 2 * alone
 
 
-def test_run_experiment_reuses_workers_only_in_the_same_directory(tmp_path, monkeypatch):
+def test_run_experiment_reuses_a_simulators_process_only_in_its_directory(tmp_path, monkeypatch):
     def make(name, folder):
         (tmp_path / folder).mkdir(exist_ok=True)
         monkeypatch.setenv("HARBOUR", name)

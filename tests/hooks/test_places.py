@@ -74,7 +74,7 @@ def on_a_stack(test):
     ],
 )
 @on_a_stack
-def test_hook_interceptor_gets_arguments_as_they_were_passed(function, args, kwargs):
+def test_decision_function_passes_on_arguments_as_they_were_passed(function, args, kwargs):
     hook = Hook(function, "somewhere.Model.function")
     made, other = hook.make_wrapper("one"), hook.make_wrapper("other")
     hook.enter(getcurrent(), lambda *given: given, None)

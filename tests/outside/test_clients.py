@@ -228,7 +228,7 @@ def test_client_libraries_raise_an_error_for_a_decision_of_another_type(child, c
 
 
 @CPP
-def test_client_libraries_can_ask_for_a_decision_without_a_rule(child):
+def test_cpp_client_can_ask_for_a_decision_without_a_rule(child):
     child.begin(play="optional")
     assert child.act(1, 2) == ended(2.0)
     child.begin(play="optional")
@@ -301,7 +301,7 @@ def test_python_client_asks_for_the_decision_of_a_decorated_function(child):
 
 
 @PYTHON
-def test_client_libraries_refuse_decisions_in_another_thread(child):
+def test_python_client_refuses_decisions_in_another_thread(child):
     error = child.begin(play="threaded")["error"]
     assert error["type"] == "RuntimeError"
     assert "thread 'callbacks'" in error["text"]
@@ -389,7 +389,7 @@ def test_client_libraries_end_a_model_that_ignores_a_stop(child, client, gone):
 
 @CPP
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
-def test_client_libraries_do_not_leak_memory_over_many_stops(child):
+def test_cpp_client_does_not_leak_memory_over_many_stops(child):
     resident = []
     for number in range(3_000):
         child.begin(play="count")
@@ -456,7 +456,7 @@ def test_client_libraries_send_a_models_error_and_play_the_next_episode(child, c
 
 
 @CPP
-def test_client_libraries_name_an_option_of_another_type(child):
+def test_cpp_client_names_an_option_of_another_type(child):
     assert child.begin(play="leave", status="x")["error"]["text"].startswith(
         'option status: "x" is not of the type'
     )

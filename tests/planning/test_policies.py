@@ -190,7 +190,7 @@ def test_planning_policies_decide_in_vector_env():
     envs.close()
 
 
-def test_rollout_policy_counts_max_steps_of_its_own_agent():
+def test_max_steps_ends_a_policys_branch_unless_other_agents_take_steps():
     def to_the_end(twin, number):
         taken = 1
         while not any(over := twin.step(1)[2:4]):

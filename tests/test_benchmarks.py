@@ -21,7 +21,7 @@ def names(page, column):
     }
 
 
-def test_a_quick_run_measures_rows_that_the_page_explains(tmp_path):
+def test_benchmark_quick_run_measures_rows_that_the_page_explains(tmp_path):
     options = f"--quick --json {tmp_path / 'json'} --write {tmp_path / 'table'}".split()
     python("-m", "benchmarks.core", *options, timeout=None)
     figures = json.loads((tmp_path / "json").read_text())
@@ -56,7 +56,7 @@ def sweeps(monkeypatch):
     multiprocessing.set_start_method(before, force=True)
 
 
-def test_both_sweeps_find_the_same_with_the_same_seeds(sweeps, tmp_path):
+def test_benchmark_sweeps_give_the_same_results_with_the_same_seeds(sweeps, tmp_path):
     if not sweeps.ABLE:
         pytest.skip("this version of Mesa's batch_run cannot run Mesa's model")
     found = sweeps.by_run_experiment(tmp_path / "ours")

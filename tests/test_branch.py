@@ -69,7 +69,7 @@ def children():
 
 
 @METHODS
-def test_branches_can_be_branched_a_few_times(method):
+def test_branches_can_be_branched_again_a_few_times(method):
     def plan(twin, number):
         twin.step(number)
         return branch(
@@ -91,7 +91,7 @@ def test_branches_can_be_branched_a_few_times(method):
 
 
 @METHODS
-def test_errors_in_a_branch_surface_as_themselves_and_end_it(method):
+def test_branch_error_is_raised_unchanged_in_the_users_process(method):
     env = trip(simulation=type("Failing", (Trip,), {"reseed": lambda trip, seed: 1 / seed}))
     before, twins = world(), []
 
@@ -135,7 +135,7 @@ class Unpicklable(Exception):
         (lambda twin, number: time.sleep(600), 0.3, "longer than"),
     ],
 )
-def test_branch_that_dies_raises_an_error_and_the_environment_continues(function, limit, message):
+def test_branch_that_dies_raises_an_error_and_the_env_continues(function, limit, message):
     env, before = trip(), children()
     with pytest.raises(BranchError, match=message):
         branch(env, function, 2, method="fork", time_limit=limit)
@@ -143,7 +143,7 @@ def test_branch_that_dies_raises_an_error_and_the_environment_continues(function
     assert children() == before
 
 
-def test_an_error_that_cannot_be_pickled_is_named():
+def test_branch_names_an_error_that_cannot_be_pickled():
     def fail(twin, number):
         error = Unpicklable(1, 2)
         error.held = (step for step in ())
@@ -157,7 +157,7 @@ def test_an_error_that_cannot_be_pickled_is_named():
 @pytest.mark.skipif(
     not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say"
 )
-def test_ending_a_branch_ends_its_nested_branches(tmp_path):
+def test_branch_that_ends_also_ends_its_nested_branches(tmp_path):
     def slow(twin, number):
         (tmp_path / str(os.getpid())).touch()
         time.sleep(600)
@@ -177,7 +177,7 @@ def test_ending_a_branch_ends_its_nested_branches(tmp_path):
     assert all(map(gone, inner))
 
 
-def test_a_model_that_does_not_repeat_itself_can_only_be_forked(tmp_path):
+def test_branch_by_replay_refuses_a_model_that_does_not_repeat_itself(tmp_path):
     dice = type("Dice", (Trip,), {"reset": lambda trip, seed=None: Trip.reset(trip)})
     env = trip(simulation=lambda: dice(tmp_path / "diary"))
     for copied in (partial(branch, env, never), partial(clone, env)):
@@ -210,7 +210,7 @@ def test_branch_by_replay_is_refused_after_too_many_decisions(view, monkeypatch)
 
 
 @METHODS
-def test_environments_without_a_pending_decision_cannot_be_branched(method):
+def test_branch_refuses_envs_without_a_pending_decision(method):
     env = single_env(Trip, POINTS, agent="walker_0", max_steps=1)
     with pytest.raises(NotResetError, match="no episode yet"):
         branch(env, never, method=method)
@@ -258,12 +258,12 @@ def test_branch_refuses_invalid_arguments(given, message):
         branch(trip(), never, **given)
 
 
-def test_threads_cannot_be_forked():
+def test_branch_by_fork_refuses_the_thread_driver():
     with pytest.raises(OptionValueError, match=r'needs .* driver="greenlet"[\s\S]*"replay"'):
         branch(trip(driver="thread"), never, method="fork")
 
 
-def test_branch_from_a_policy_of_the_environment_is_refused():
+def test_branch_refuses_calls_from_a_policy_of_the_env():
     env = trip(taken=0, policies={"guide_0": lambda observation: branch(env, never)})
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
@@ -272,7 +272,7 @@ def test_branch_from_a_policy_of_the_environment_is_refused():
 @pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set"
 )
-def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
+def test_branch_runs_no_more_processes_at_a_time_than_there_are_cores(tmp_path):
     env = trip()
 
     def alone(twin, number):
@@ -290,7 +290,7 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
         os.sched_setaffinity(0, cores)
 
 
-def test_actions_are_replayed_as_they_were_given():
+def test_branch_replays_actions_as_they_were_given():
     """Later changes by the user, a policy or the mapping do not count; no policy is asked twice."""
     walk, buffer, asked = next(iter(POINTS)), np.zeros(1, np.float32), []
     amount = define(
@@ -316,7 +316,7 @@ def test_actions_are_replayed_as_they_were_given():
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
-def test_branches_and_clones_of_random_worlds_are_exact():
+def test_branches_and_clones_of_random_models_continue_exactly():
     """Also of files and of global generators.
 
     For a larger number: ``python -m tests.worlds.saved 10000 branches``.
@@ -422,7 +422,7 @@ def held_by(model):
         (mapped("r+"), r"shared memory \(/tmp/"),
     ],
 )
-def test_resource_that_prevents_a_fork_is_named_or_replay_is_used(held, name):
+def test_branch_replays_or_names_the_resource_that_prevents_a_fork(held, name):
     env = held_by(type("Model", (Holding,), {"open": held}))
     env.step(1)
     for copied in (partial(branch, env, never), partial(clone, env)):
@@ -436,7 +436,7 @@ def test_resource_that_prevents_a_fork_is_named_or_replay_is_used(held, name):
     assert found == [found[0]] * 5
 
 
-def test_a_model_that_shows_a_progress_bar_is_forked(monkeypatch):
+def test_branch_forks_a_model_that_shows_a_progress_bar(monkeypatch):
     tqdm = pytest.importorskip("tqdm").tqdm
     monkeypatch.setattr(tqdm, "monitor", None)  # so that this model starts it
     env = held_by(type("Model", (Holding,), {"open": a_progress_bar}))
@@ -445,14 +445,14 @@ def test_a_model_that_shows_a_progress_bar_is_forked(monkeypatch):
 
 
 @pytest.mark.parametrize("held", [mapped("r"), mapped("c"), a_semaphore])
-def test_memory_that_no_process_can_change_is_forked(held):
+def test_branch_forks_a_model_with_read_only_shared_memory(held):
     env = held_by(type("Model", (Holding,), {"open": held}))
     with anonymous_memory(None):  # which the simulation does not hold
         assert branch(env, rest_of_archive, 1, method="fork") == [rest_of_archive(env)]
 
 
 @pytest.mark.thorough
-def test_memory_that_was_shared_before_the_import_does_not_count():
+def test_branch_forks_despite_memory_shared_before_the_import():
     code = """
 import mmap
 memory = mmap.mmap(-1, 100)
@@ -464,7 +464,7 @@ print(branch(env, lambda env, number: number, 1, method="fork"))
     assert run_code(code) == "[0]\n"
 
 
-def test_resources_of_the_user_do_not_keep_a_branch_from_forking():
+def test_branch_forks_despite_open_resources_of_the_user():
     env, (one, other) = trip(), socket.socketpair()
     with one, other, mmap.mmap(-1, 100), subprocess.Popen(["cat"], stdin=subprocess.PIPE):
         assert branch(env, lambda twin, number: os.getpid(), method="fork") != [os.getpid()]
@@ -489,7 +489,7 @@ class Listening(Holding):
         os.close(writing)
 
 
-def test_asyncio_event_loops_continue_in_a_fork(monkeypatch):
+def test_branch_by_fork_continues_asyncio_event_loops(monkeypatch):
     env = held_by(Listening)
     env.step(1)
     assert (
@@ -517,7 +517,7 @@ class Polling(Holding):
 
 
 @pytest.mark.skipif(not hasattr(select, "epoll"), reason="only Linux has epoll")
-def test_simulations_with_an_epoll_object_are_replayed():
+def test_branch_replays_simulations_with_an_epoll_object():
     env = held_by(Polling)
     with pytest.raises(BranchError, match=r"an epoll object \(descriptor \d+\).*replay"):
         branch(env, rest_of_archive, 2, method="fork")
@@ -527,7 +527,7 @@ def test_simulations_with_an_epoll_object_are_replayed():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("flush", [False, True])
-def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
+def test_branches_and_clones_print_their_output_once_and_in_order(flush):
     code = f"""
         from simenv_marl import branch, clone
         from tests.worlds.copied import trip
@@ -548,7 +548,7 @@ def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
 
 
 @METHODS
-def test_a_reseed_changes_nothing_of_the_present_and_decides_by_the_rule(method):
+def test_branch_with_a_seed_keeps_the_present_observation_and_reward(method):
     class Reseeded(Trip):
         def reseed(self, seed):
             super().reseed(seed)
@@ -570,7 +570,7 @@ def drawn(env, number):
 
 
 @METHODS
-def test_the_generators_of_the_process_are_seeded_for_each_future(method):
+def test_branch_seeds_global_generators_for_each_future(method):
     """Those of a base policy: alike for the same seeds, and not with the simulation's numbers."""
     env = trip(simulation=Lucky, global_rng=True)
 
@@ -610,7 +610,7 @@ def test_branch_seeds_and_restores_any_global_numpy_bit_generator(method):
 
 
 @METHODS
-def test_torchs_generator_is_seeded_too_and_forks_use_none_of_its_threads(monkeypatch, method):
+def test_branch_seeds_torchs_generator_for_each_future(monkeypatch, method):
     """The threads do not come along, and torch would wait for them."""
     threads = []
     generator = types.SimpleNamespace(state=0, get_state=lambda: generator.state)
@@ -625,7 +625,7 @@ def test_torchs_generator_is_seeded_too_and_forks_use_none_of_its_threads(monkey
 
 
 @METHODS
-def test_seeds_without_a_reseed_raise_an_error_with_the_remedy(monkeypatch, method):
+def test_branch_with_seeds_refuses_a_model_without_reseed(monkeypatch, method):
     monkeypatch.setattr(os, "fork", None)
     for env in (held_by(Polling), trip(simulation=type("Fixed", (Trip,), {"reseed": None}))):
         with pytest.raises(BranchError, match=r"reseed\(seed\)[\s\S]*global_rng=True"):
@@ -633,7 +633,7 @@ def test_seeds_without_a_reseed_raise_an_error_with_the_remedy(monkeypatch, meth
         env.step(1)
 
 
-def test_a_file_that_the_collector_closes_in_a_fork_is_left_out(monkeypatch, tmp_path):
+def test_branch_forks_a_model_whose_open_file_is_garbage_collected(monkeypatch, tmp_path):
     """Garbage, such as the fonts of plots, may go at any time in the fork."""
     env = trip()
     replace = separation._replace

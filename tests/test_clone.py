@@ -88,7 +88,7 @@ def test_clones_and_branches_continue_alike_and_independently(view, options, met
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
-def test_a_replayed_clone_leaves_the_generators_of_its_user_alone():
+def test_clone_by_replay_leaves_the_users_generators_unchanged():
     class Drawing(Trip):
         def reset(self, seed=None):
             random.random()
@@ -99,7 +99,7 @@ def test_a_replayed_clone_leaves_the_generators_of_its_user_alone():
     assert world() == before
 
 
-def test_clones_of_stepped_clones_show_acts_and_times_of_the_original():
+def test_clone_of_a_clone_has_the_times_and_agents_of_the_original():
     class Short(Duel):
         ceiling = 2.5  # where the one on the left retires
 
@@ -122,7 +122,7 @@ def test_clones_of_stepped_clones_show_acts_and_times_of_the_original():
 
 
 @METHODS
-def test_checkpoint_rewinds_after_its_original_is_closed(method):
+def test_clone_continues_after_its_original_is_closed(method):
     env = trip("single, limited", taken=2)
     checkpoint = clone(clone(env, method=method), method=method)
     env.close()
@@ -133,7 +133,7 @@ def test_checkpoint_rewinds_after_its_original_is_closed(method):
 
 
 @pytest.mark.thorough
-def test_clones_have_many_generations_and_end_when_they_are_collected():
+def test_clones_of_clones_end_when_they_are_garbage_collected():
     twin, numbers = clone(trip(), method="fork"), []
     for _ in range(30):
         numbers.append(number_of(twin))
@@ -147,7 +147,7 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
 
 @pytest.mark.thorough
 @METHODS
-def test_clones_keep_the_step_count_of_wrappers(method):
+def test_clones_keep_the_step_count_of_time_limit_wrappers(method):
     env = trip("single, limited", Free)
     twin = clone(env, method=method)
     twin.step(1)
@@ -164,7 +164,7 @@ def test_clones_keep_the_step_count_of_wrappers(method):
 
 
 @pytest.mark.thorough
-def test_call_runs_functions_in_the_process_of_the_clone():
+def test_clone_call_runs_functions_in_the_process_of_the_clone():
     twin, factor = clone(trip(), method="fork"), 2
     assert number_of(twin) != os.getpid() == number_of(clone(twin, method="replay"))
     assert twin.call(lambda env, by: (factor * by, env.step(1)[4]["time"]), 4) == (8, 3.0)
@@ -182,7 +182,7 @@ def test_call_runs_functions_in_the_process_of_the_clone():
 
 @METHODS
 @EVERY_VIEW
-def test_errors_in_clones_keep_their_type(view, method):
+def test_clone_errors_keep_their_type(view, method):
     failing = type("Failing", (Free,), {"luck": lambda trip: 1 / (1 - trip.day)})
     twin = clone(trip(view, failing, taken=0), method=method)
     before = twin.unwrapped.call(outcome)
@@ -200,7 +200,7 @@ def test_errors_in_clones_keep_their_type(view, method):
 @METHODS
 @pytest.mark.parametrize("view", ["aec, padded", "parallel", "single, limited", "joint"])
 @pytest.mark.parametrize("options", [{}, LUCKY])
-def test_the_same_seed_gives_clones_and_branches_the_same_future(view, options, method):
+def test_clones_and_branches_with_the_same_seed_have_the_same_future(view, options, method):
     env, threaded = trip(view, **options), trip(view, driver="thread", **options)
     random.gauss(0, 1)  # the generators keep a second number
     np.random.standard_normal()
@@ -225,7 +225,7 @@ def fail(*_):
 
 @pytest.mark.thorough
 @METHODS
-def test_a_clone_that_cannot_be_made_leaves_nothing(method, monkeypatch):
+def test_clone_that_cannot_be_made_leaves_no_process(method, monkeypatch):
     faulty, fixed = (
         trip(simulation=type("Model", (Trip,), {"reseed": reseed})) for reseed in (fail, None)
     )
@@ -263,7 +263,7 @@ USES = [
 
 
 @FORKS
-def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
+def test_clone_interrupted_while_it_is_made_leaves_no_process():
     before = children()
 
     def interrupt(*_):
@@ -285,7 +285,7 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
 @pytest.mark.thorough
 @pytest.mark.parametrize("end", [lambda twins: twins[0].close(), list.clear])
 @pytest.mark.parametrize(("use", "told"), USES)
-def test_only_episodes_that_begin_in_a_clone_are_unwound_and_closed(use, told, end, tmp_path):
+def test_clone_unwinds_and_closes_only_episodes_that_begin_in_it(use, told, end, tmp_path):
     env = trip(simulation=lambda: Trip(tmp_path / "diary"))
     twins = [clone(env, method="fork")]
     use(twins[0])
@@ -382,7 +382,7 @@ def test_clone_that_dies_raises_an_error_and_other_clones_continue():
     assert future(other) == future(env)
 
 
-def test_pid_of_an_ended_clone_of_a_clone_is_not_killed(monkeypatch):
+def test_clone_never_kills_a_reused_process_id(monkeypatch):
     """The system may have given the number to another process."""
     twin = clone(trip(), method="fork")
     deeper = clone(twin, method="fork")
@@ -397,7 +397,7 @@ def test_pid_of_an_ended_clone_of_a_clone_is_not_killed(monkeypatch):
     twin.close()
 
 
-def test_threads_use_a_clone_one_at_a_time(tmp_path):
+def test_clone_can_be_used_by_one_thread_at_a_time(tmp_path):
     def wait(env):
         (tmp_path / "begun").touch()
         while not (tmp_path / "over").exists():
@@ -420,7 +420,7 @@ def test_threads_use_a_clone_one_at_a_time(tmp_path):
     twin.step(1)
 
 
-def test_default_socket_timeout_does_not_affect_clones():
+def test_clones_are_not_affected_by_the_default_socket_timeout():
     socket.setdefaulttimeout(0.05)
     try:
         twin = clone(trip(), method="fork")
@@ -435,7 +435,7 @@ def test_default_socket_timeout_does_not_affect_clones():
 
 
 @FORKS
-def test_a_clone_is_refused_in_a_fork_of_its_users_process_and_unharmed():
+def test_clone_refuses_use_in_a_fork_of_its_users_process():
     twin, child = clone(trip(), method="fork"), os.fork()
     if child == 0:
         with suppress(BaseException):
@@ -497,7 +497,7 @@ def lean():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("function", [crowd, starve, lean])
-def test_clones_use_one_descriptor_each_and_leak_none(function):
+def test_clones_use_one_file_descriptor_each_and_leak_none(function):
     alone(function)
 
 
@@ -512,7 +512,7 @@ class Cyclic:
 
 
 @pytest.mark.thorough
-def test_forked_clones_free_objects_that_the_original_frees():
+def test_clone_by_fork_frees_objects_that_the_original_frees():
     env = trip()
     model = env.simulation
     model.alive = [Cyclic(), Cyclic()]
@@ -530,7 +530,7 @@ def test_forked_clones_free_objects_that_the_original_frees():
 
 
 @pytest.mark.thorough
-def test_closed_clone_within_a_chain_of_clones_is_freed():
+def test_clone_closed_within_a_chain_of_clones_is_freed():
     twin = clone(trip(), method="fork")
     depth = twin.call(lambda env: len(inspect.stack()))
     links = []
@@ -569,7 +569,7 @@ class Broken(Trip):
 @pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
-def test_model_error_surfaces_before_the_errors_that_follow_from_it(view, method):
+def test_clone_raises_a_model_error_before_errors_that_follow_from_it(view, method):
     twin = clone(trip(view, Broken, taken=0), method=method)
     with pytest.raises(ZeroDivisionError, match="in the model"):
         all(True for _ in iter(lambda: move(twin), None))
@@ -592,7 +592,7 @@ def unsendable():
 
 
 @pytest.mark.parametrize("kind", unsendable())
-def test_an_info_that_cannot_be_sent_is_named_and_hides_no_error(kind):
+def test_clone_names_an_info_that_cannot_be_pickled(kind):
     def leave(env, fails):
         env.episode.pending.info["more"] = unsendable()[kind]
         if fails:
@@ -618,7 +618,7 @@ def test_an_info_that_cannot_be_sent_is_named_and_hides_no_error(kind):
 @METHODS
 @pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
 @pytest.mark.parametrize("kind", unsendable())
-def test_actions_that_cannot_be_sent_are_invalid(kind, view, method):
+def test_clone_refuses_actions_that_cannot_be_pickled(kind, view, method):
     env = trip(view)
     twin = clone(env, method=method)
     bad = action = unsendable()[kind]
@@ -633,7 +633,7 @@ def test_actions_that_cannot_be_sent_are_invalid(kind, view, method):
 # -- ends -----------------------------------------------------------------------------------------
 
 
-def test_clone_whose_process_exits_is_always_an_error():
+def test_clone_raises_an_error_if_its_process_has_exited():
     twin = clone(trip(), method="fork")
     with pytest.raises(BranchError, match=r"has died, because .*os\._exit\(0\)"):
         twin.call(lambda env: os._exit(0))
@@ -663,12 +663,12 @@ def reap(order):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("order", ["0123", "3210", "1032", "0213"])
-def test_closed_clones_leave_no_zombie_to_a_first_process(order):
+def test_closed_clones_leave_no_zombie_process_in_a_container(order):
     alone(reap, order)
 
 
 @pytest.mark.parametrize("at", ["waitpid", "kill"])
-def test_second_close_ends_the_process_left_by_an_interrupted_one(at, monkeypatch):
+def test_clone_second_close_ends_the_process_after_an_interrupted_close(at, monkeypatch):
     twin = clone(trip(), method="fork")
     number = number_of(twin)
 
@@ -715,7 +715,7 @@ def handled(place):
 
 
 @pytest.mark.thorough
-def test_signal_handlers_of_the_user_do_not_run_in_clones(tmp_path):
+def test_clones_do_not_run_the_users_signal_handlers(tmp_path):
     alone(handled, str(tmp_path / "signals"))
 
 
@@ -730,7 +730,7 @@ def hold(env, number=0):
 
 
 @pytest.mark.thorough
-def test_fork_that_waits_for_a_lock_forever_raises_an_error():
+def test_clone_by_fork_that_waits_for_a_lock_forever_raises_an_error():
     HELD.acquire()  # as by a thread that is not in the fork
     env = trip()
     began = time.monotonic()
@@ -791,7 +791,7 @@ def by_hand(env):
         lambda env: branch(env, lambda env, _: not make_slowly(), method="fork", time_limit=20)[0],
     ],
 )
-def test_a_fork_while_another_thread_makes_an_environment_does_not_hang(forked):
+def test_clone_by_fork_does_not_hang_while_a_thread_makes_an_env(forked):
     env = trip()
     make_slowly()
     with ThreadPoolExecutor(1) as pool:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from simenv_marl import save_episode
 from simenv_marl.__main__ import main
+from tests.worlds.saved import mid_episode
 
 MODELS = '''
 """Two walks, one of which limps."""
@@ -49,7 +51,7 @@ def beside_the_models(tmp_path, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_command_check_finds_nothing_in_a_sound_simulation():
+def test_check_command_finds_nothing_in_a_sound_simulation():
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
     command = [sys.executable, "-m", "simenv_marl", "check", "walking:Walk", "--episodes", "2"]
@@ -60,7 +62,7 @@ def test_command_check_finds_nothing_in_a_sound_simulation():
     assert done.stdout.startswith("Walk: nothing to complain of")
 
 
-def test_a_simulation_with_an_error_ends_the_command_with_status_1(capsys):
+def test_check_command_ends_with_status_1_if_it_finds_an_error(capsys):
     limits = ["--episodes", "2", "--seed", "4", "--max-steps", "5", "--time-limit", "59.5"]
     assert main(["check", "walking:Limping", *limits]) == 1
     text = capsys.readouterr().out
@@ -74,7 +76,7 @@ def test_a_simulation_with_an_error_ends_the_command_with_status_1(capsys):
     assert told["findings"][0]["severity"] == "error"
 
 
-def test_an_inspection_is_printed_as_text_or_as_json(capsys):
+def test_inspect_command_prints_text_or_json(capsys):
     assert main(["inspect", "walking:Walk", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calls"] == "choose{10}"
     assert main(["inspect", "walking:Walk"]) == 0
@@ -82,7 +84,7 @@ def test_an_inspection_is_printed_as_text_or_as_json(capsys):
     assert all(part in text for part in ("walker_0", "choose{10}", "aec, parallel, single, joint"))
 
 
-def test_points_can_be_given_by_name(capsys):
+def test_check_and_inspect_commands_take_points_by_name(capsys):
     greenhouse = "examples.greenhouse_coop.model.Greenhouse."
     assert main(["check", "walking:Walk", "--points", "walking.Walk.chose"]) == 2
     assert "chose" in capsys.readouterr().err
@@ -108,7 +110,9 @@ def test_points_can_be_given_by_name(capsys):
     ],
 )
 @pytest.mark.parametrize("command", ["check", "inspect"])
-def test_commands_refuse_objects_that_are_no_simulation(command, target, told, capsys):
+def test_check_and_inspect_commands_refuse_objects_that_are_no_simulation(
+    command, target, told, capsys
+):
     assert main([command, target]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -129,7 +133,7 @@ def test_commands_refuse_objects_that_are_no_simulation(command, target, told, c
         *("new", "new plain", "new netlogo tank"),
     ],
 )
-def test_wrong_arguments_end_the_command_with_status_2(arguments, capsys):
+def test_commands_end_with_status_2_for_wrong_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments.split())
     assert caught.value.code == 2
@@ -158,10 +162,8 @@ def test_commands_refuse_invalid_numbers(command, options, capsys):
         assert option.replace("-", "_") in capsys.readouterr().err
 
 
-def test_an_episode_of_a_file_is_shown_up_to_a_decision(capsys):
-    from tests.files.test_episodes import begun, save_episode
-
-    env = begun(taken=5)
+def test_replay_command_shows_an_episode_file_up_to_a_decision(capsys):
+    env = mid_episode(taken=5)
     save_episode(env, "episode")
     assert main(["replay", "episode"]) == 0
     head, *decisions, now = capsys.readouterr().out.splitlines()

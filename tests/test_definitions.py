@@ -52,7 +52,7 @@ class BigPump(Pump):
     power = 30
 
 
-def test_decision_function_outside_environments_is_the_bound_rule():
+def test_decision_function_outside_an_env_calls_the_models_rule():
     pump = Pump()
     assert (
         pump.flow(1.5, unit="m", fast=True)
@@ -91,7 +91,7 @@ def test_decision_function_keeps_its_metadata_and_is_pickled_by_name():
         assert pickle.loads(pickle.dumps(function)) == function
 
 
-def test_sentinels_survive_pickling():
+def test_rule_and_truncated_constants_survive_pickling():
     for sentinel in (RULE, TRUNCATED):
         assert pickle.loads(pickle.dumps(sentinel)) is sentinel
         assert repr(sentinel).startswith("simenv_marl.")
@@ -137,7 +137,7 @@ GOAL = {"achieved_goal_mapping": list, "desired_goal_mapping": list, "compute_re
     ],
     ids=plainly,
 )
-def test_definitions_that_cannot_work_are_refused(changes, match):
+def test_make_step_refuses_definitions_that_cannot_work(changes, match):
     """Also where they are made of others by replacing parts."""
     with pytest.raises(DefinitionError, match=f"make_step: .*{match}"):
         define(**changes)
@@ -146,7 +146,7 @@ def test_definitions_that_cannot_work_are_refused(changes, match):
         dataclasses.replace(define(), **spared | changes)
 
 
-def test_a_definition_that_is_replaced_in_part_is_made_ready_as_a_whole():
+def test_definition_can_be_changed_with_dataclasses_replace():
     definition = define(
         action_space=spaces.Discrete(2),
         action_space_mapping={0: "no", 1: "yes"},
@@ -195,7 +195,7 @@ def test_make_step_refuses_objects_that_are_no_functions(function):
         ("weakest", lambda pump: pump.weakest(), ("class",), {}),
     ],
 )
-def test_mappings_of_static_and_class_methods_receive_bound_arguments(name, call, args, kwargs):
+def test_static_and_class_methods_pass_bound_arguments_to_mappings(name, call, args, kwargs):
     seen = []
 
     def observe(*args, **kwargs):
@@ -226,7 +226,7 @@ def told_by(env, *actions):
     ],
     ids=["from 0", "from -1"],
 )
-def test_action_space_mapping_may_be_a_dict_of_decisions(space, answers, refused):
+def test_action_space_mapping_can_be_a_dict_of_decisions(space, answers, refused):
     decide = decision(action_space=space, action_space_mapping=answers)
     env = single_env(calling(*[decide] * len(answers)), decide)
     env.reset()
@@ -237,7 +237,7 @@ def test_action_space_mapping_may_be_a_dict_of_decisions(space, answers, refused
     assert told_by(env, *map(np.int64, answers)) == list(answers.values())
 
 
-def test_apply_runs_in_the_simulation_in_place_of_the_rule():
+def test_apply_runs_in_the_simulation_instead_of_the_models_rule():
     factor = decision(agent="factor_0")
     decide = decision(apply=lambda action: action * factor(), agent="decider_0")
     env = aec_env(calling(decide, decide), [decide, factor])
@@ -293,7 +293,7 @@ def finished(made):
         (order, apply_later, ([], (5, "tea")), ([], ("rule", "tea"))),
     ],
 )
-def test_generator_or_coroutine_point_decides_when_it_starts(function, apply, told, rule):
+def test_generator_or_coroutine_decision_is_asked_for_when_it_starts(function, apply, told, rule):
     changes = {"apply": apply} if apply else {}
     decide = define(observation_space_mapping=lambda good: [len(started), 0], **changes)(function)
     started = []
@@ -311,7 +311,7 @@ def test_generator_or_coroutine_point_decides_when_it_starts(function, apply, to
     assert env.simulation.log == [told, rule]
 
 
-def test_one_function_may_have_many_definitions():
+def test_decision_function_can_have_several_definitions():
     early = decision(action_space_mapping=lambda action: "early")
     late = define(action_space_mapping=lambda action: "late")(early)
     last = define(action_space_mapping=lambda action: "last")(late)
@@ -321,7 +321,7 @@ def test_one_function_may_have_many_definitions():
         assert told == [["early"], ["late"], ["last"]]
 
 
-def test_choices_are_called_once_per_decision_and_give_the_mask():
+def test_choices_function_is_called_once_per_decision_and_gives_the_mask():
     made = []
 
     def move(board, *, side):
@@ -342,7 +342,7 @@ def test_choices_are_called_once_per_decision_and_give_the_mask():
 
 
 @pytest.mark.parametrize("choices", [list, lambda: range(5)])
-def test_empty_or_too_many_choices_are_errors(choices):
+def test_choices_that_are_empty_or_too_many_raise_an_error(choices):
     decide = decision(action_space=spaces.Discrete(4), choices=choices)
     with pytest.raises(MaskError, match="choices"):
         single_env(calling(decide), decide).reset()
@@ -374,14 +374,14 @@ WATER, GO, ALSO_GO, GIVEN = (
         ([GO, GIVEN], ["go_1", "go_0"]),
     ],
 )
-def test_default_names_are_the_functions_letters_and_never_collide(points, names):
+def test_default_agent_names_come_from_function_names_and_are_unique(points, names):
     env = aec_env(calling(GO), points)
     assert env.possible_agents == names
     env.reset()
     assert env.agent_selection == names[points.index(GO)]
 
 
-def test_difference_is_zero_at_first_and_outside_episodes():
+def test_difference_reward_is_zero_at_first_and_outside_episodes():
     count, used = [0], np.array(0.0)  # which changes in place
     change = difference(lambda: used)
 

@@ -141,11 +141,11 @@ def sizes():
         )
     ],
 )
-def test_the_library_keeps_its_budget(budget, sizes):
+def test_library_keeps_its_size_budget(budget, sizes):
     assert sizes[budget] <= BUDGETS[budget]
 
 
-def test_files_and_lines_are_short():
+def test_library_files_and_lines_are_short():
     longest = BUDGETS["longest_files"]
     long_files, long_lines = {}, []
     for path in MODULES:
@@ -158,7 +158,7 @@ def test_files_and_lines_are_short():
     assert long_lines == []
 
 
-def test_folders_have_few_modules():
+def test_library_folders_have_few_modules():
     modules = Counter(path.parent for path in MODULES if path.name != "__init__.py")
     most = BUDGETS["modules_of_a_folder"]
     assert {folder.name: number for folder, number in modules.items() if number > most} == {}
@@ -198,13 +198,13 @@ def foreign_writes(path):
                     yield f"{path.relative_to(PACKAGE).as_posix()} {ast.unparse(target)}"
 
 
-def test_fields_are_written_by_their_own_object():
+def test_library_fields_are_written_only_by_their_own_object():
     found = {write for path in MODULES for write in foreign_writes(path)}
     assert found == FOREIGN_WRITES.keys()
     assert len(FOREIGN_WRITES) <= BUDGETS["foreign_writes"]
 
 
-def test_rooms_use_the_interface_of_the_core():
+def test_library_modules_use_only_the_public_interface_of_core():
     """They import from ``core`` itself, which lists its names, and read no private one."""
     interface = set(core.__all__)
     fields = private_fields(PACKAGE / "core")
@@ -240,13 +240,13 @@ def private_fields(place):
 # -- directions -----------------------------------------------------------------------------------
 
 
-def test_no_modules_import_each_other_not_even_for_types():
+def test_library_modules_have_no_circular_imports_even_for_types():
     graph = grimp.build_graph("simenv_marl", cache_dir=None)
     imports = {name: graph.find_modules_directly_imported_by(name) for name in graph.modules}
     TopologicalSorter(imports).prepare()  # raises an error that names a circle
 
 
-def test_folders_of_the_core_import_in_one_direction_also_for_types():
+def test_folders_of_core_import_in_one_direction_even_for_types():
     graph = grimp.build_graph("simenv_marl", cache_dir=None)
     order = ["copies", "episodes", "plans", "switching", "values"]
     for folder in order:
@@ -260,7 +260,7 @@ def test_folders_of_the_core_import_in_one_direction_also_for_types():
 # -- public names ---------------------------------------------------------------------------------
 
 
-def test_public_names_are_in_one_place_each():
+def test_public_names_are_each_in_one_module():
     rooms = {room: importlib.import_module(f"simenv_marl.{room}").__all__ for room in ROOMS}
     names = [*simenv_marl.__all__, *(name for room in rooms.values() for name in room)]
     assert {name for name in names if names.count(name) > 1} == {"SimEnvError", "evaluate"}

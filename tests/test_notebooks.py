@@ -31,7 +31,7 @@ ZeroDivisionError: division by zero
 
 
 @pytest.mark.parametrize("page", notebooks.PAGES)
-def test_the_text_of_a_notebook_has_nothing_that_only_pages_know(page):
+def test_docs_notebook_text_has_no_markup_that_only_pages_understand(page):
     made = notebooks.notebook(DOCS, page)
     text = "\n".join(cell["source"] for cell in made["cells"] if cell["cell_type"] == "markdown")
     for mark in (".md)", ".md#", "{download}", "```", ".ipynb"):
@@ -50,7 +50,7 @@ def page(tmp_path):
     return tmp_path / "page.md"
 
 
-def test_an_executed_notebook_is_written_beside_its_page(page):
+def test_docs_notebook_is_executed_and_written_beside_its_page(page):
     notebooks.write_notebooks(page.parent, ("page",))
     text, model, *cells = nbformat.read(
         page.parent / "_notebooks" / "page.ipynb", as_version=4
@@ -74,7 +74,7 @@ def test_an_executed_notebook_is_written_beside_its_page(page):
 @pytest.mark.parametrize(
     ("shown", "wrong"), [("\n2\n", "\n3\n"), ("\na line", "\nno line"), ("ZeroDiv", "Zero")]
 )
-def test_a_page_that_shows_something_else_is_refused(page, shown, wrong):
+def test_docs_notebook_is_refused_if_its_page_shows_other_output(page, shown, wrong):
     page.write_text(PAGE.replace(shown, wrong))
     with pytest.raises(ValueError, match="and its page has"):
         notebooks.write_notebooks(page.parent, ("page",))

@@ -74,7 +74,7 @@ def linked(page, text):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_page_has_short_code_lines_and_names_their_requirements(page):
+def test_docs_page_has_short_code_lines_and_names_required_packages(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {
@@ -96,7 +96,7 @@ def words_of(page):
     return len((DOCS / f"{page}.md").read_text(encoding="utf-8").split())
 
 
-def test_the_map_has_few_pages_and_each_is_short():
+def test_docs_have_few_pages_and_few_words():
     captions = re.findall(
         r":caption: (.+)\n\n((?:[\w-]+\n)+)", (DOCS / "index.md").read_text(encoding="utf-8")
     )
@@ -112,7 +112,7 @@ def test_the_map_has_few_pages_and_each_is_short():
 
 
 @pytest.mark.parametrize("room", ["simenv_marl", *simenv_marl.ROOMS])
-def test_the_page_of_a_room_lists_the_names_that_it_has(room):
+def test_docs_reference_page_lists_all_public_names_of_its_module(room):
     text = ROOMS[room].read_text(encoding="utf-8")
     names = set(getattr(simenv_marl, room, simenv_marl).__all__)
     described = re.findall(
@@ -200,7 +200,7 @@ def untested(command, written):
 
 
 @pytest.mark.parametrize("page", FRONT)
-def test_a_command_of_a_page_is_run_by_tests_or_marked_as_not_run(page):
+def test_docs_page_commands_are_run_by_tests_or_marked_as_not_run(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     written = re.findall(r"-m simenv_marl new \w+ (\w+)", text)
     found = {
@@ -219,7 +219,7 @@ def run(code):
     return names
 
 
-def test_the_code_of_the_front_page_has_the_rewards_that_it_shows():
+def test_readme_code_gives_the_rewards_that_it_shows():
     (code,) = blocks("index.md")
     env = run(code)["env"]
     assert env.reset(seed=1)[0] == [5.0]
@@ -228,7 +228,7 @@ def test_the_code_of_the_front_page_has_the_rewards_that_it_shows():
     env.close()
 
 
-def test_pictures_and_links_of_the_readme_lead_to_files():
+def test_readme_pictures_and_links_lead_to_files():
     """No badge stands for a service that does not exist."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
@@ -244,14 +244,14 @@ def told_in_an_episode(env, seed):
     return [(turn.agent, turn.observation.tolist(), *turn[2:5]) for turn in turns]
 
 
-def test_migrated_pettingzoo_example_matches_the_hand_written_one():
+def test_docs_migrated_pettingzoo_example_matches_the_hand_written_one():
     before, after = map(run, blocks("coming-from.md", "PettingZoo"))
     told = [told_in_an_episode(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [told_in_an_episode(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
 
 
-def test_migrated_example_of_the_paper_runs(monkeypatch):
+def test_docs_migrated_example_of_the_paper_runs(monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
     (code,) = blocks("coming-from.md", "Sim-Env")
     names = run(code)
@@ -261,7 +261,7 @@ def test_migrated_example_of_the_paper_runs(monkeypatch):
     names["env"].close()
 
 
-def test_problems_page_quotes_real_messages_and_errors():
+def test_docs_problems_page_quotes_real_error_messages():
     text = (DOCS / "problems.md").read_text(encoding="utf-8")
     quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
     assert len(quoted) >= 20
@@ -284,5 +284,5 @@ TERMS = (
 )  # fmt: skip
 
 
-def test_the_glossary_explains_the_terms_that_users_search_for():
+def test_docs_glossary_explains_the_terms_that_users_search_for():
     assert set(TERMS) <= set((DOCS / "glossary.md").read_text(encoding="utf-8").splitlines())

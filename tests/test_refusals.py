@@ -58,13 +58,13 @@ TELL = f"{__name__}.Model.tell"
         ("joint", "action", spaces.MultiBinary(2), r"not MultiBinary\(2\) of 'tell_0'"),
     ],
 )
-def test_a_view_names_the_point_whose_space_prevents_it(view, part, space, match):
+def test_env_error_names_the_decision_point_whose_space_does_not_fit(view, part, space, match):
     points = {CHOOSE: define(), TELL: define(**{f"{part}_space": space})}
     with pytest.raises(ViewError, match=match):
         generate_env(Model, points, view=view, flatten=True)()
 
 
-def test_one_agent_of_several_needs_the_single_view():
+def test_agent_option_is_refused_except_in_single_env():
     points = {CHOOSE: define(agent=lambda model: "a"), TELL: define(agent=lambda model: "b")}
     with pytest.raises(AgentError, match="other views take no agent="):
         generate_env(Model, points, view="turn", agent="a")
@@ -75,7 +75,7 @@ def test_one_agent_of_several_needs_the_single_view():
 @pytest.mark.parametrize(
     "part", ["observation_space_mapping", "reward_mapping", "agent", "action_mask_mapping"]
 )
-def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
+def test_env_refuses_a_mapping_with_a_positional_simulation_parameter(part):
     def mapping(model, _simulation=None):
         return 0
 
@@ -87,7 +87,7 @@ def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
 
 
 @pytest.mark.filterwarnings("ignore:.* override")
-def test_no_decision_error_names_functions_that_override_the_point():
+def test_no_decision_error_names_subclass_methods_that_hide_the_decision():
     env = single_env(Derived, {CHOOSE: define()})
     with pytest.raises(
         NoDecisionError, match=rf"{CHOOSE}; .* called instead.*{__name__}\.Derived\.choose"
@@ -96,7 +96,7 @@ def test_no_decision_error_names_functions_that_override_the_point():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
+def test_env_possible_agents_error_says_how_to_declare_them(make):
     env = make(Model, {CHOOSE: define(agent=lambda model: "ant")})
     assert not hasattr(env, "possible_agents")
     with pytest.raises(AttributeError, match="declare them with the option possible_agents="):
@@ -105,7 +105,7 @@ def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
         print(env.posible_agents)
 
 
-def test_an_episode_that_decides_in_a_late_thread_names_it_and_the_point():
+def test_env_error_names_the_thread_that_decides_too_late():
     calls, answers = SimpleQueue(), SimpleQueue()
     middleware = Thread(
         target=lambda: [answers.put(call()) for call in iter(calls.get, None)], name="middleware"
@@ -134,7 +134,7 @@ MAKERS = ("aec_env", "parallel_env", "single_env", "joint_env", "vector_env", "g
 OPTIONS = {field.name for field in fields(Options)}
 
 
-def test_type_checkers_know_the_options_that_there_are():
+def test_type_checkers_know_the_options_of_envs():
     assert set(ViewOptions.__annotations__) == OPTIONS
     views = {"policies", "record", "record_all", "step_timeout"}
     assert set(EpisodeOptions.__annotations__) == OPTIONS - views
@@ -142,7 +142,7 @@ def test_type_checkers_know_the_options_that_there_are():
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_help_explains_every_option(name):
+def test_help_of_envs_explains_every_option(name):
     text = pydoc.plain(pydoc.render_doc(getattr(simenv_marl, name)))
     for option in OPTIONS:
         assert f"- ``{option}``: " in text
@@ -150,7 +150,7 @@ def test_help_explains_every_option(name):
     assert text.rstrip().count("Raises:") == 1
 
 
-def test_hints_name_the_closest_candidates():
+def test_error_hints_name_the_closest_existing_names():
     assert (
         did_you_mean("sheep_1", ["sheep_0", "sheep_2", "wolf_0"])
         == "; did you mean sheep_2 or sheep_0?"
@@ -174,14 +174,14 @@ def test_hints_name_the_closest_candidates():
         ),
     ],
 )
-def test_messages_hint_at_the_name_that_was_meant(wrong, hint):
+def test_error_messages_suggest_the_name_that_was_meant(wrong, hint):
     env = aec_env(Walk, Walk.choose)
     env.reset(seed=1)
     with pytest.raises(simenv_marl.SimEnvError, match=f"did you mean {hint}"):
         wrong(env)
 
 
-def test_import_of_a_moved_name_says_which_module_has_it():
+def test_import_error_of_a_moved_name_says_which_module_has_it():
     expected = "pad_agents is in simenv_marl.envs: from simenv_marl.envs import pad_agents"
     with pytest.raises(AttributeError, match=expected):
         print(simenv_marl.pad_agents)
@@ -193,7 +193,7 @@ def test_import_of_a_moved_name_says_which_module_has_it():
     exec("from simenv_marl import envs, plugins, registration")
 
 
-def test_a_free_threaded_build_is_refused():
+def test_importing_the_library_refuses_a_free_threaded_python():
     shown = run_code(
         """
         import sysconfig

@@ -41,7 +41,7 @@ def made(identity, **options):
     return gymnasium.make(identity, **options).unwrapped
 
 
-def test_registration_gives_ids_for_points_and_multi_agent_views():
+def test_register_simulation_gives_ids_for_points_and_multi_agent_envs():
     assert [*SINGLES, JOINT, TURN, COOP] == copied.IDS
     assert set(copied.IDS[:-1]) <= set(gymnasium.registry)
     for kind, base in (("aec", pettingzoo.AECEnv), ("parallel", pettingzoo.ParallelEnv)):
@@ -63,7 +63,7 @@ def sailed(env):
     return env.simulation.boat.place
 
 
-def test_points_outside_the_single_view_run_their_rule_or_policy(register):
+def test_registered_single_env_runs_other_points_by_rule_or_policy(register):
     """A policy may be given under any name of the point, and then answers in every view."""
     assert -0.61 < sailed(made(SINGLES[0])) < -0.39
     assert (
@@ -81,7 +81,7 @@ def test_points_outside_the_single_view_run_their_rule_or_policy(register):
         assert 0.14 < sailed(made(ids[0])) < 0.36
 
 
-def test_make_of_a_registered_id_takes_options():
+def test_gymnasium_make_of_a_registered_id_takes_options():
     env = begun(made(SINGLES[0], max_steps=1, render_mode="ansi"))
     assert env.step(RULE)[2:4] == (False, True)
     assert env.render().startswith("at ")
@@ -95,7 +95,7 @@ def test_make_of_a_registered_id_takes_options():
 
 
 @pytest.mark.filterwarnings("ignore:.*is out of date")  # Gymnasium's advice
-def test_registration_keeps_options_and_may_be_repeated_or_versioned(register):
+def test_register_simulation_can_be_repeated_or_versioned(register):
     def length(ids, **options):
         return len(play(pettingzoo.make("aec", ids[-1], **options)))
 
@@ -116,7 +116,7 @@ def test_registration_keeps_options_and_may_be_repeated_or_versioned(register):
     assert [env.step(RULE)[3] for _ in range(2)] == [False, True]
 
 
-def test_registration_has_only_the_points_that_it_is_given(register):
+def test_register_simulation_uses_only_the_points_that_it_is_given(register):
     steering = {
         f"{Boat.__module__}.Boat.steer_boat": define(
             action_space=spaces.Discrete(2), agent="helm_0"
@@ -129,7 +129,7 @@ def test_registration_has_only_the_points_that_it_is_given(register):
     assert made(ids[0]).action_space == spaces.Discrete(2)
 
 
-def test_entities_have_no_single_view_and_are_in_that_of_another_point(register):
+def test_register_simulation_gives_no_single_env_for_points_of_entities(register):
     clerk = decision(agent="clerk_0")
     points = {clerk: define(agent="clerk_0"), **beings()}
     roster = {Being.act: ["being_0"]}  # an option of a point that the single view lacks
@@ -146,7 +146,7 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
 
 @pytest.mark.parametrize("view", ["Joint", "Turn"])
 @pytest.mark.parametrize("flatten", [False, True])
-def test_flatten_is_an_option_of_joint_and_turn_views_alone(register, flatten, view):
+def test_registered_ids_take_flatten_only_for_joint_env_and_turn_env(register, flatten, view):
     """The option of ``make`` comes before the registration's, and that before the variant's."""
     ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
     for options, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
@@ -160,7 +160,7 @@ def test_flatten_is_an_option_of_joint_and_turn_views_alone(register, flatten, v
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
-def test_state_in_info_is_an_option_of_joint_and_turn_views_only(register):
+def test_registered_ids_take_state_in_info_only_for_joint_and_turn_env(register):
     class Charted(Voyage):
         def state(self):
             return [self.boat.place]
@@ -173,7 +173,7 @@ def test_state_in_info_is_an_option_of_joint_and_turn_views_only(register):
     pettingzoo.make("aec", ids[-1]).reset()
 
 
-def test_the_turn_view_takes_all_decisions_and_limits_of_vectors(register):
+def test_registered_turn_env_works_in_make_vec(register):
     env = made(TURN, max_steps=3)
     observation, info = env.reset(seed=1)
     assert (observation["kind"], info["agent"]) == (0, "helm_0")
@@ -190,7 +190,7 @@ def test_the_turn_view_takes_all_decisions_and_limits_of_vectors(register):
     assert ids[-3:-1] == ["apart/Joint-v0", "apart/Turn-v0"]
 
 
-def test_names_of_points_become_camel_case_and_stay_distinct(register):
+def test_registered_ids_are_distinct_camel_case_names_of_points(register):
     """The ids of joint and turn views are taken, and names differ in spelling or class alone."""
     named = [
         "Robot.joint",
@@ -240,7 +240,7 @@ def test_names_of_points_become_camel_case_and_stay_distinct(register):
         ({"simulation": Variant("hot summer", Voyage), "name": None}, OptionValueError),
     ],
 )
-def test_a_refused_registration_leaves_the_registries_unchanged(register, changes, error):
+def test_register_simulation_leaves_registries_unchanged_if_it_refuses(register, changes, error):
     registries = gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry
     before = [dict(registry) for registry in registries]
     with pytest.raises(error):
@@ -276,7 +276,7 @@ if __name__ == "__main__":
     ]
 
 
-def test_human_rendering_uses_rgb_arrays_of_the_simulation(register, monkeypatch):
+def test_registered_env_human_rendering_uses_the_simulations_rgb_arrays(register, monkeypatch):
     class Pictured(Voyage):
         render_modes = ("rgb_array",)
 
@@ -294,7 +294,7 @@ def test_human_rendering_uses_rgb_arrays_of_the_simulation(register, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["two_words", "two-words"])
-def test_ids_are_found_in_both_spellings_where_a_name_has_underscores(register, name):
+def test_registered_ids_with_underscores_are_found_in_both_spellings(register, name):
     """PettingZoo lists ``coop_v0`` as ``coop-v0``."""
     ids = register(Voyage, name=name)
     assert ids[-1] == f"{name}/coop_v0"

@@ -16,13 +16,13 @@ def loaded(path):
     return yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
 
 
-def test_the_licence_is_filled_in():
+def test_repository_licence_is_filled_in():
     text = (ROOT / "LICENSE").read_text(encoding="utf-8")
     assert "[name of copyright owner]" not in text
     assert f"Copyright 2026 {PROJECT['authors'][0]['name']}\n" in text
 
 
-def test_the_citation_is_of_this_version_and_names_the_paper():
+def test_repository_citation_has_this_version_and_names_the_paper():
     citation = loaded("CITATION.cff")
     assert citation["version"] == simenv_marl.__version__
     assert citation["license"] == PROJECT["license"]
@@ -39,7 +39,7 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     assert paper["identifiers"][0]["value"].removeprefix("arXiv:") in paper["url"]
 
 
-def test_read_the_docs_uses_existing_configuration_and_extras():
+def test_read_the_docs_configuration_names_existing_files_and_extras():
     config = loaded(".readthedocs.yaml")
     assert (ROOT / config["sphinx"]["configuration"]).is_file()
     (install,) = config["python"]["install"]

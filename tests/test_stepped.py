@@ -81,7 +81,7 @@ def walked(seed, steps, **parameters):
     return model.place
 
 
-def test_stepped_simulation_by_the_rule_matches_the_plain_model():
+def test_stepped_simulation_with_rule_actions_runs_like_without_env():
     assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(
         3, 20, drift=0.1
     )
@@ -99,7 +99,7 @@ def test_stepped_simulation_by_the_rule_matches_the_plain_model():
 
 
 @pytest.mark.parametrize("steps", [None, 1000])
-def test_episode_ends_when_the_stepped_model_stops_running(steps):
+def test_stepped_simulation_ends_when_the_model_stops_running(steps):
     env = begun(aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE), 1)
     while not env.terminations["stride_0"]:
         env.step(2)
@@ -123,7 +123,7 @@ def test_stepped_simulation_passes_the_seed_to_the_model():
     assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)
 
 
-def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
+def test_stepped_simulation_seeds_a_model_whose_scenario_holds_the_seed():
     with pytest.raises(
         SimulationError, match=r"Planned'> takes a scenario.*lambda seed, \*\*parameters"
     ):
@@ -136,7 +136,7 @@ def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
     assert simulate(fixed, seed=2).model.place == walked(4, 5)
 
 
-def test_copied_and_pickled_stepped_simulations_run_the_same():
+def test_stepped_simulation_runs_the_same_after_copying_and_pickling():
     simulation = SteppedSimulation(Walk, 5, drift=0.5)
     for twin in (copy.deepcopy(simulation), pickle.loads(pickle.dumps(simulation))):
         assert simulate(twin, seed=2).model.place == walked(2, 5, drift=0.5)
@@ -154,7 +154,7 @@ def test_stepped_simulation_refuses_invalid_arguments():
         simulate(SteppedSimulation(Walk, 3, length=1))
 
 
-def test_stepped_simulation_has_only_the_points_that_it_is_given():
+def test_stepped_simulation_uses_only_the_points_that_it_is_given():
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
     assert evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=[1]).frame[
@@ -166,7 +166,7 @@ def test_stepped_simulation_has_only_the_points_that_it_is_given():
     assert played.model.place == walked(2, 5, drift=1.0)
 
 
-def test_a_model_without_steps_runs_for_units_of_time():
+def test_stepped_simulation_runs_a_model_without_steps_for_units_of_time():
     ring = {f"{__name__}.Clocked.ring": define()}
     env = single_env(SteppedSimulation(Clocked, 2), ring)
     _, info = env.reset(seed=1)
@@ -179,7 +179,7 @@ def test_a_model_without_steps_runs_for_units_of_time():
     assert env.unwrapped.simulation.model.log == [3] * 4
 
 
-def test_the_time_is_the_number_of_steps_where_a_model_has_no_clock():
+def test_stepped_simulation_counts_steps_as_time_if_the_model_has_no_clock():
     class Timeless(Walk):
         def time(self):
             return "late"

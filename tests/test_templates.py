@@ -29,7 +29,7 @@ def run(folder, *arguments):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_written_template_passes_its_own_tests(kind, tmp_path):
+def test_new_command_writes_a_template_that_passes_its_own_tests(kind, tmp_path):
     done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
     assert done.stderr == ""
     written = {
@@ -49,7 +49,7 @@ def test_a_written_template_passes_its_own_tests(kind, tmp_path):
 
 
 @pytest.mark.thorough
-def test_the_command_check_finds_a_written_template(tmp_path):
+def test_check_command_accepts_a_written_template(tmp_path):
     assert main(["new", "plain", "water_tank", "--folder", str(tmp_path)]) == 0
     checked = run(tmp_path, "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
     assert "nothing to complain of" in checked.stdout
@@ -72,7 +72,7 @@ def test_template_training_beats_the_rule(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_templates_import_only_packages_that_the_command_names(kind):
+def test_template_imports_only_packages_that_the_new_command_names(kind):
     told = {
         "simenv_marl",
         "numpy",
@@ -94,7 +94,7 @@ def test_templates_import_only_packages_that_the_command_names(kind):
 
 
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])
-def test_policies_answer_one_observation_as_they_answer_many(kind):
+def test_template_policies_answer_one_observation_as_they_answer_many(kind):
     template = import_module(f"simenv_marl.testing.templates.{kind}")
     policy = template.train(1, 1)
     env = begun(template.env(), 3)
@@ -112,7 +112,7 @@ def test_policies_answer_one_observation_as_they_answer_many(kind):
         (["Mesa"], "cannot be the name of a module"),  # of the same file as mesa, on some systems
     ],
 )
-def test_invalid_template_names_are_refused(names, told, tmp_path, capsys):
+def test_new_command_refuses_invalid_names(names, told, tmp_path, capsys):
     for name in names:
         assert main(["new", "mesa", name, "--folder", str(tmp_path / "new")]) == 2
         error = capsys.readouterr().err
@@ -131,7 +131,7 @@ def test_template_classes_do_not_clash_with_existing_names(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
+def test_template_env_with_rule_actions_runs_like_the_model_without_env(kind):
     template = import_module(f"simenv_marl.testing.templates.{kind}")
     plain = begun(template.MySimulation(), 7)
     plain.run()
@@ -146,7 +146,7 @@ def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_template_names_observations_and_actions(kind):
+def test_template_has_labels_of_observations_and_actions(kind):
     template = import_module(f"simenv_marl.testing.templates.{kind}")
     points = {
         point: replace(step, display_mapping=None)
@@ -160,7 +160,7 @@ def test_a_template_names_observations_and_actions(kind):
     env.close()
 
 
-def test_agents_of_the_mesa_template_are_born_and_die():
+def test_mesa_template_agents_are_born_and_die():
     """Those that starve are terminated, those that see the last day truncated."""
     env = begun(import_module("simenv_marl.testing.templates.mesa").env(), 7)
     first = set(env.agents)
@@ -173,7 +173,7 @@ def test_agents_of_the_mesa_template_are_born_and_die():
     assert set(ends.values()) == {True, False}
 
 
-def test_infos_of_the_simpy_template_have_masks_and_elapsed_times():
+def test_simpy_template_infos_have_masks_and_elapsed_times():
     env = import_module("simenv_marl.testing.templates.simpy").env()
     _, info = env.reset(seed=7)
     assert info["action_mask"].sum() > 1  # a forced choice is not asked for

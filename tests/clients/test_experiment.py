@@ -57,7 +57,7 @@ def runs(library, tmp_path_factory):
     return out
 
 
-def test_every_question_is_answered_and_judged_on_the_way(library, runs):
+def test_greenhouse_experiment_answers_each_of_its_questions(library, runs):
     for question in QUESTIONS[library]:
         run = found(runs, f"{library}-{question}-3")
         assert (run["library"], run["question"], run["seed"], run["budget"]) == (
@@ -72,7 +72,7 @@ def test_every_question_is_answered_and_judged_on_the_way(library, runs):
         assert np.isfinite(run["final"]["value"])
 
 
-def test_run_of_a_seed_is_the_same_in_another_process(library, runs, tmp_path):
+def test_greenhouse_experiment_run_is_the_same_in_another_process(library, runs, tmp_path):
     question = QUESTIONS[library][0]
     carry_out(library, tmp_path, questions=[question], seeds=[3], hashes="2")
     name = f"{library}-{question}-3"
@@ -80,7 +80,7 @@ def test_run_of_a_seed_is_the_same_in_another_process(library, runs, tmp_path):
     assert found(runs, f"{library}-{question}-4")["final"] != found(runs, name)["final"]
 
 
-def test_results_are_drawn_from_the_runs_that_exist(library, runs, tmp_path):
+def test_greenhouse_experiment_draws_results_of_existing_runs(library, runs, tmp_path):
     made = shutil.copytree(runs, tmp_path / "runs")
     baselines.main(["--episodes", "60", "--seeds", "0", "--out", str(made)])
     folders = {"data": tmp_path / "data", "figures": tmp_path / "figures"}

@@ -13,7 +13,7 @@ def check(found, untrained):
     assert trained["difference"] > before["difference"]
 
 
-def test_stable_baselines3_gains_over_the_rule(monkeypatch):
+def test_pension_fund_stable_baselines3_gains_over_the_models_rule(monkeypatch):
     define, learn = blocks("_clients_pension.md", "Train it with Stable-Baselines3")
     names = {"__name__": "__main__"}
     exec(define, names)
@@ -25,7 +25,7 @@ def test_stable_baselines3_gains_over_the_rule(monkeypatch):
     check(names["found"], untrained)
 
 
-def test_torchrl_gains_over_the_rule():
+def test_pension_fund_torchrl_gains_over_the_models_rule():
     policy, loss = together.learner()
     together.train(policy, loss)
     trained = together.compare(policy)

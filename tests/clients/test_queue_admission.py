@@ -4,12 +4,12 @@ from examples.queue_admission import train
 from examples.queue_admission.exact import ADMIT_ALL, worth
 
 
-def test_a_short_training_by_time_beats_all_trainings_by_decision():
+def test_queue_admission_training_by_time_beats_training_by_decision():
     """By decision, the best table admits all: see ``tests/examples/test_queue_admission.py``."""
     assert worth(train.table_of(train.train_dqn(0, steps=20_000))) > 1.1 * worth(ADMIT_ALL)
 
 
-def test_the_command_writes_a_row_for_each_training_and_a_figure(tmp_path):
+def test_queue_admission_command_writes_a_row_per_training_and_a_figure(tmp_path):
     results, figure = tmp_path / "results.csv", tmp_path / "figure.png"
     train.main(
         [

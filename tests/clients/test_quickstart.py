@@ -7,7 +7,7 @@ from .commands import python
 from .page import DOCS
 
 
-def test_ppo_earns_more_than_the_rule(tmp_path):
+def test_quickstart_ppo_earns_more_than_the_models_rule(tmp_path):
     printed = python(shutil.copy(DOCS / "quickstart.py", tmp_path))
     earned = re.fullmatch(r"rule earns (\d+) a quarter\nPPO  earns (\d+) a quarter\n", printed)
     rule, learned = map(int, earned.groups())

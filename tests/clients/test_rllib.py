@@ -47,7 +47,7 @@ def _also_without_torch():
 
 
 @pytest.mark.parametrize("view", HIVES)
-def test_padded_views_pass_rllibs_checker_and_end_its_episodes(view):
+def test_rllib_checker_accepts_envs_with_pad_agents(view):
     """Without padding, a death and a time limit in one step set neither flag of ``__all__``."""
     env = hive(view)
     check_multiagent_environments(env)
@@ -112,7 +112,7 @@ def test_rllib_page_trains_two_agents_and_extracts_their_policies():
 
 
 @pytest.mark.parametrize("view", HIVES)
-def test_policy_shared_by_agents_that_are_born_learns(view):
+def test_policy_shared_by_agents_that_are_born_and_die_learns(view):
     names = {"__name__": "__main__"}
     exec(blocks("_clients_rllib.md")[4], names)
     algorithm = hive_config(view, DEFINITION).build_algo()

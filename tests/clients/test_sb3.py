@@ -92,13 +92,13 @@ def rescaled(env):
     ],
     ids=["single", "goal", "joint", "greenhouse", "joint greenhouse", "registered"],
 )
-def test_sb3_accepts_the_views(make):
+def test_stable_baselines3_accepts_single_joint_and_turn_env(make):
     env = make()
     check_env(env, warn=env.action_space == spaces.Box(-1, 1, env.action_space.shape))
     env.close()
 
 
-def test_vectors_with_and_without_workers_learn_the_same():
+def test_stable_baselines3_learns_the_same_with_and_without_workers():
     learnt = []
     for kind in (DummyVecEnv, SubprocVecEnv):
         envs = make_vec_env(two_bees, n_envs=2, vec_env_cls=kind)
@@ -189,7 +189,7 @@ class Deaths(BaseCallback):
 
 @pytest.mark.parametrize("seconds", [int(os.environ.get("SECONDS_OF_DEATHS", "9"))])
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="descriptors are not told of")
-def test_training_survives_the_deaths_of_workers(seconds):
+def test_stable_baselines3_training_survives_dead_workers(seconds):
     def learn(kill):
         envs = Vector(
             vector_env(
@@ -233,7 +233,7 @@ def test_training_survives_the_deaths_of_workers(seconds):
         print(f"{len(steps)} steps of simulation {place}, {deaths} deaths")
 
 
-def test_hindsight_replay_learns_a_goal():
+def test_stable_baselines3_learns_a_goal_by_hindsight_replay():
     model = SAC(
         "MultiInputPolicy",
         crane(),
@@ -251,7 +251,7 @@ def test_hindsight_replay_learns_a_goal():
     assert worth(model, crane()) > -3
 
 
-def test_masks_of_a_joint_view_reach_the_policy():
+def test_stable_baselines3_policy_gets_masks_of_joint_env():
     env = joint_env(HiveSim, points(), **TWO_BEES)
     MaskablePPO("MlpPolicy", env, n_steps=100, batch_size=50, seed=0).learn(200)
     env.reset(seed=0)
@@ -260,7 +260,7 @@ def test_masks_of_a_joint_view_reach_the_policy():
     assert get_action_masks(env).tolist() == [amount > 0 for amount in nectar] + [True] * 3
 
 
-def test_code_of_the_stable_baselines3_page_runs(monkeypatch):
+def test_code_of_the_stable_baselines3_page_runs_as_printed(monkeypatch):
     steps = page.steps("Stable-Baselines3 and sb3-contrib", monkeypatch)
     names = next(steps)
     env = single_env(names["FourWeeks"], names["points"])

@@ -5,7 +5,7 @@ import runpy
 from .page import DOCS
 
 
-def test_generations_beat_the_rule_that_they_learn_against():
+def test_self_play_generations_beat_the_models_rule():
     street = runpy.run_path(str(DOCS / "street.py"))
     pool = street["train"](generations=1, steps=4_000)
     found = street["rate"](dict(enumerate(pool.policies)), seeds=range(10))

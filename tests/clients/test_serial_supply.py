@@ -57,7 +57,7 @@ def plain(seed):
     return simulation(network, PERIODS, rand_seed=seed, progress_bar=False, consistency_checks="N")
 
 
-def test_the_rule_costs_as_much_as_in_stockpyl_alone():
+def test_serial_supply_rule_costs_as_much_as_in_stockpyl():
     env = aec_env(SerialSupply, **OPTIONS)
     for seed in (1, 2):
         env.reset(seed=seed)
@@ -68,18 +68,18 @@ def test_the_rule_costs_as_much_as_in_stockpyl_alone():
         assert simulate(SerialSupply, seed=seed, **OPTIONS).cost == plain(seed)
 
 
-def test_the_simulation_passes_the_checks():
+def test_serial_supply_passes_check_simulation():
     check_simulation(SerialSupply, **OPTIONS).raise_for_errors()
 
 
-def test_optimal_base_stocks_cost_as_much_as_in_the_book():
+def test_serial_supply_optimal_base_stocks_cost_as_much_as_in_the_book():
     seeds = range(40)
     best = cost(base_stocks(), seeds)
     assert best == pytest.approx(OPTIMUM, rel=0.02)
     assert cost({}, seeds) > 1.3 * best
 
 
-def test_observations_are_the_same_in_all_views():
+def test_serial_supply_observations_are_the_same_in_every_env():
     turns, rounds = aec_env(SerialSupply, **OPTIONS), parallel_env(SerialSupply, **OPTIONS)
     turns.reset(seed=3)
     seen, _ = rounds.reset(seed=3)
@@ -93,7 +93,7 @@ def test_observations_are_the_same_in_all_views():
         seen, *_ = rounds.step(actions)
 
 
-def test_discrete_actions_order_in_half_units():
+def test_serial_supply_discrete_actions_order_in_half_units():
     env = parallel_env(SerialSupply, DISCRETE, **OPTIONS)
     env.reset(seed=1)
     env.step(dict.fromkeys(STAGES, 9))
@@ -102,7 +102,7 @@ def test_discrete_actions_order_in_half_units():
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_trains_and_its_policies_run(recipe):
+def test_serial_supply_recipe_trains_and_its_policies_run(recipe):
     needs, steps = RECIPES[recipe]
     package, _, name = needs.partition(":")
     library = pytest.importorskip(package)
@@ -118,14 +118,14 @@ def test_a_recipe_trains_and_its_policies_run(recipe):
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLE.glob("*.py")), ids=lambda path: path.stem)
-def test_the_glue_of_a_recipe_is_short(path):
+def test_serial_supply_recipe_has_few_lines_of_glue_code(path):
     text = path.read_text(encoding="utf-8")
     if "# -- glue: begin" in text:
         glue = text.partition("# -- glue: begin")[2].partition("# -- glue: end")[0]
         assert len([line for line in glue.splitlines()[1:] if line.strip()]) <= GLUE
 
 
-def test_the_table_resumes_and_shows_all_learners(tmp_path):
+def test_serial_supply_table_resumes_and_shows_all_learners(tmp_path):
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("torchrl")
     table = import_module("examples.serial_supply.table")

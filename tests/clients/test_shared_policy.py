@@ -11,7 +11,7 @@ from simenv_marl.data import collect_episodes
 SMALL = {"width": 10, "height": 10, "initial_sheep": 30, "initial_wolves": 12}
 
 
-def test_a_seed_determines_everything():
+def test_shared_sheep_policy_training_depends_only_on_its_seed():
     def run(seed):
         herd, course = train.train(2, seed, decisions=5000, each=1000, ticks=20, **SMALL)
         return herd.logits.state_dict(), [
@@ -25,7 +25,7 @@ def test_a_seed_determines_everything():
     assert not all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_sheep_learn_to_live_longer():
+def test_shared_sheep_policy_learns_to_live_longer():
     """On held-out seeds of the default meadow, each sheep has more turns than before."""
 
     def turns(policy):

@@ -11,7 +11,7 @@ from simenv_marl.envs import pad_agents
 from . import page
 
 
-def test_padded_view_has_all_agents_at_all_times():
+def test_skrl_gets_all_agents_at_all_times_from_pad_agents():
     options = {"possible_agents": BEES, "state_space": "observations"}
     env = wrap_env(
         pad_agents(parallel_env(HiveSim, points(DEFINITION), **options)), wrapper="pettingzoo"
@@ -28,7 +28,7 @@ def test_padded_view_has_all_agents_at_all_times():
     env.close()
 
 
-def test_code_of_the_skrl_page_runs(monkeypatch):
+def test_code_of_the_skrl_page_runs_as_printed(monkeypatch):
     steps = page.steps("skrl", monkeypatch)
     names = next(steps)
     env, learner = names["env"], names["learners"]
@@ -54,7 +54,7 @@ def test_code_of_the_skrl_page_runs(monkeypatch):
     env.close()
 
 
-def test_single_views_and_vectors_of_them_are_wrapped():
+def test_skrl_wraps_single_env_and_vector_env():
     env = wrap_env(single_env(GreenhouseSim, WATERING), wrapper="gymnasium", verbose=False)
     observation, _ = env.reset()
     assert observation.shape == (1, 6)

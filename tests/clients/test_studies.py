@@ -10,7 +10,7 @@ from . import commands, page
 pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that is theirs
 
 
-def test_the_study_of_imitation_runs(capsys):
+def test_imitation_study_runs(capsys):
     pytest.importorskip("minari")
     pytest.importorskip("torchrl")
     from studies.imitation import rule
@@ -22,14 +22,14 @@ def test_the_study_of_imitation_runs(capsys):
 
 
 @pytest.mark.parametrize("plainly", [[], ["--plainly"]])
-def test_the_study_of_planned_imitation_runs(plainly):
+def test_planned_imitation_study_runs(plainly):
     pytest.importorskip("minari")
     pytest.importorskip("torchrl")
     options = "--budget", 2800, "--learners", 1, "--steps", 5, "--seeds", 1, "--workers", 2
     assert "learner 1: " in commands.python("-m", "studies.imitation.plans", *options, *plainly)
 
 
-def test_learner_sweep_resumes(tmp_path):
+def test_learner_sweep_study_resumes(tmp_path):
     pytest.importorskip("optuna")
     line = ["--days", 250, "--seeds", 1, "--trials", 1, "--out", tmp_path]
     told = commands.python("-m", "studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
@@ -37,7 +37,7 @@ def test_learner_sweep_resumes(tmp_path):
     assert told == commands.python("-m", "studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
 
 
-def test_learner_sweep_table_equals_the_one_in_the_docs(tmp_path, monkeypatch):
+def test_learner_sweep_study_table_equals_the_one_in_the_docs(tmp_path, monkeypatch):
     (
         pytest.importorskip("optuna"),
         pytest.importorskip("seaborn"),
@@ -54,7 +54,7 @@ def test_learner_sweep_table_equals_the_one_in_the_docs(tmp_path, monkeypatch):
     assert names["axes"].get_ylabel() == "gain"
 
 
-def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
+def test_wolf_sheep_study_trains_and_draws_its_pictures(tmp_path):
     pytest.importorskip("torchrl")
     pytest.importorskip("mesa")
     from studies.wolf_sheep import picture

@@ -116,7 +116,7 @@ def story_around(env):
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_wrapped_views_match_a_wrapped_hand_written_environment(name):
+def test_supersuit_wrappers_work_as_around_an_env_written_by_hand(name):
     arguments, seen = WRAPPERS[name]
 
     def make():
@@ -131,7 +131,7 @@ def test_wrapped_views_match_a_wrapped_hand_written_environment(name):
     assert alike(story_around(wrapped), story_around(by_hand))
 
 
-def test_one_policy_of_stable_baselines3_for_all_agents():
+def test_supersuit_trains_one_stable_baselines3_policy_for_all_agents():
     """As PettingZoo's tutorial has it."""
     envs = suit["pettingzoo_env_to_vec_env_v1"](suit["black_death_v3"](hive()))
     envs = suit["concat_vec_envs_v1"](envs, 4, num_cpus=1, base_class="stable_baselines3")
@@ -150,7 +150,7 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     )
 
 
-def test_options_replace_wrappers():
+def test_env_options_give_the_same_results_as_supersuit_wrappers():
     boxes = {
         "action_space": Box(0, 1, (1,)),
         "action_space_mapping": lambda action: int(2.9 * action[0]),
@@ -184,7 +184,7 @@ def test_options_replace_wrappers():
     assert max(rewards["bee_0"] for _, rewards in by_options[1:]) == 0.5
 
 
-def test_code_of_the_supersuit_page_runs(monkeypatch):
+def test_code_of_the_supersuit_page_runs_as_printed(monkeypatch):
     (names,) = page.steps("SuperSuit", monkeypatch)
     assert names["observations"].shape == (4, 6)
     assert names["rewards"].shape == (4,)

@@ -54,7 +54,7 @@ def test_tianshou_policy_draws_no_masked_action(monkeypatch):
     next(steps)  # trains
 
 
-def test_episode_with_births_and_deaths_ends_later_if_padded():
+def test_tianshou_collects_whole_episodes_with_births_if_agents_are_padded():
     """Without padding an episode ends for it when the first of them dies."""
 
     def days(env):
@@ -73,7 +73,7 @@ def test_episode_with_births_and_deaths_ends_later_if_padded():
     assert days(PettingZooEnv(pad_agents(env))) == plain
 
 
-def test_code_of_the_tianshou_page_runs(monkeypatch):
+def test_code_of_the_tianshou_page_runs_as_printed(monkeypatch):
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
     names = next(steps)

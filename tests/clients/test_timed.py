@@ -99,7 +99,7 @@ def expected_returns(buffer, last_values, dones):
     ("learner", "simulation"),
     [(PPO, Visits), (PPO, Named), (A2C, Named), (MaskablePPO, Masked)],
 )
-def test_returns_have_the_discounts_of_their_intervals(learner, simulation, monkeypatch):
+def test_timed_rollout_buffer_discounts_returns_by_elapsed_time(learner, simulation, monkeypatch):
     checked = []
     compute = TimedRolloutBuffer.compute_returns_and_advantage
 
@@ -119,7 +119,7 @@ def test_returns_have_the_discounts_of_their_intervals(learner, simulation, monk
     assert checked == [True, True]
 
 
-def test_truncated_episodes_are_continued_by_their_own_discount():
+def test_timed_rollout_buffer_bootstraps_truncated_episodes_with_discount():
     """The learner adds gamma times the value; without gamma, all of it must be there."""
     returns = []
     for gamma in (0.0, 0.9):
@@ -133,7 +133,7 @@ def test_truncated_episodes_are_continued_by_their_own_discount():
 
 
 @pytest.mark.parametrize("simulation", [Visits, Named])
-def test_samples_have_the_discounts_of_their_transitions(simulation):
+def test_timed_replay_buffer_samples_have_their_transitions_discounts(simulation):
     policy = "MultiInputPolicy" if simulation is Named else "MlpPolicy"
     model = DQN(
         policy, vector(simulation), buffer_size=400, learning_starts=50, train_freq=4,
@@ -163,14 +163,14 @@ def test_samples_have_the_discounts_of_their_transitions(simulation):
     [{"rollout_buffer_class": TimedRolloutBuffer}, {"replay_buffer_class": TimedReplayBuffer}],
     ids=["rollout", "replay"],
 )
-def test_infos_without_a_discount_are_an_error(options):
+def test_timed_buffers_raise_an_error_for_infos_without_a_discount(options):
     learner = PPO if "rollout_buffer_class" in options else DQN
     model = learner("MlpPolicy", vector(discount_rate=None), **options)
     with pytest.raises(OptionValueError, match="discount_rate="):
         model.learn(10)
 
 
-def test_a_rollout_buffer_is_filled_by_a_learner():
+def test_timed_rollout_buffer_is_filled_by_a_learner():
     buffer = TimedRolloutBuffer(4, Visits.space, spaces.Discrete(3))
     with pytest.raises(OptionValueError, match="collect_rollouts"):
         buffer.add(np.zeros(2), np.zeros(1), np.zeros(1), np.zeros(1), None, None)

@@ -18,11 +18,11 @@ VIEWS = {"parallel": parallel_env, "aec": aec_env}
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 
 
-def test_torchrl_checks_of_the_page_pass():
+def test_code_of_the_torchrl_page_passes_torchrls_checks():
     exec(blocks("_clients_torchrl.md")[0], {})
 
 
-def test_box_actions_pass_the_checks():
+def test_torchrl_checks_accept_box_actions():
     for make in (greenhouse.parallel_env, greenhouse.raw_env, greenhouse.env):
         check_env_specs(PettingZooWrapper(make(), use_mask=True))
     check_env_specs(GymWrapper(greenhouse.watering_env()))
@@ -32,7 +32,7 @@ def test_box_actions_pass_the_checks():
 @pytest.mark.parametrize("done_on_any", [True, False])
 @pytest.mark.parametrize("grouped", [None, {"bees": BEES}], ids=["apart", "together"])
 @pytest.mark.parametrize("definition", [DEFINITION, MASKED], ids=["free", "masked"])
-def test_agents_that_are_born_and_die_pass_the_checks(view, definition, grouped, done_on_any):
+def test_torchrl_checks_accept_agents_that_are_born_and_die(view, definition, grouped, done_on_any):
     env = PettingZooWrapper(
         pad_agents(view(HiveSim, points(definition), possible_agents=BEES)),
         use_mask=True,
@@ -53,7 +53,7 @@ def test_agents_that_are_born_and_die_pass_the_checks(view, definition, grouped,
 
 
 @EVERY_VIEW
-def test_the_state_is_part_of_the_tensors(view):
+def test_torchrl_tensors_contain_the_env_state(view):
     options = {"possible_agents": BEES, "state_space": spaces.Box(0, 1, (4,), np.float32)}
     env = PettingZooWrapper(
         pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True
@@ -71,7 +71,7 @@ def worth(policy):
 
 
 @EVERY_VIEW
-def test_policy_shared_by_agents_that_are_born_learns(view):
+def test_policy_shared_by_agents_that_are_born_and_die_learns(view):
     env = hive_torchrl.make(view)
     policy, loss = hive_torchrl.learner(env)
     before = worth(policy)

@@ -69,7 +69,7 @@ TEAM = {"team_reward": difference(lambda clinic: clinic.right)}
 
 
 @pytest.mark.filterwarnings("ignore:of [0-9]+ actions in this episode")
-def test_a_learner_beats_the_rule_in_the_turn_view_alone():
+def test_turn_env_learner_beats_the_models_rule():
     contenders = {"rule": {}}
     for name, make, policy_of in (
         ("turn", turn_env, turn_policy),

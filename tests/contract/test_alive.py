@@ -140,7 +140,7 @@ def rule_log(view, source, seed, agent=by_number):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env])
 @pytest.mark.filterwarnings("ignore:actions that no decision used")
-def test_rule_matches_the_plain_run_of_a_model_with_weak_sets(view, kind):
+def test_env_with_rule_actions_runs_weak_set_models_like_without_env(view, kind):
     source = meadow_of(kind)
     for seed in range(4):
         expected = plain_log(source, seed)
@@ -149,14 +149,14 @@ def test_rule_matches_the_plain_run_of_a_model_with_weak_sets(view, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rule_matches_the_plain_run_of_one_named_agent(kind):
+def test_env_with_rule_actions_runs_a_one_agent_model_like_without_env(kind):
     source = meadow_of(kind)
     for seed in range(4):
         for view in (aec_env, single_env, parallel_env):
             assert rule_log(view, source, seed, agent="animals") == plain_log(source, seed)
 
 
-def test_policies_that_answer_rule_change_nothing():
+def test_simulate_with_policies_answering_rule_runs_like_without_policies():
     source = meadow_of("list")
     for seed in range(4):
         point = {PREY: definition(agent=by_number)}
@@ -204,7 +204,7 @@ BAG = {
 
 
 @pytest.mark.parametrize("action", [RULE, 2])
-def test_split_items_and_choices_are_freed_after_their_call(action):
+def test_aec_env_frees_split_items_and_choices_after_their_call(action):
     env = aec_env(Bag, BAG)
     play(env, action, seed=1)
     log = env.simulation.log
@@ -249,7 +249,7 @@ def dish(**changes):
     return env
 
 
-def test_a_freed_argument_of_the_reward_mapping_makes_the_last_reward_zero():
+def test_last_reward_is_zero_if_the_model_has_freed_the_entity():
     env = dish(observation_space_mapping=lambda cell: [5.0], reward_mapping=lambda cell, size: size)
     with pytest.warns(UserWarning, match=r"has freed self .*the reward is 0\.0.*removed_by"):
         observation, reward, terminated, _, _ = env.step(RULE)
@@ -257,7 +257,7 @@ def test_a_freed_argument_of_the_reward_mapping_makes_the_last_reward_zero():
     assert (list(observation), reward, terminated) == ([5.0], 0.0, True)
 
 
-def test_mappings_that_take_other_arguments_are_asked_at_the_end():
+def test_last_observation_and_reward_use_arguments_that_still_exist():
     env = dish(
         observation_space_mapping=lambda *, food: food[:1], reward_mapping=lambda *, size: size
     )
@@ -266,7 +266,7 @@ def test_mappings_that_take_other_arguments_are_asked_at_the_end():
     assert (list(observation), reward, terminated) == ([8.0], 4.0, True)
 
 
-def test_a_freed_argument_keeps_the_last_observation():
+def test_agent_keeps_its_last_observation_if_the_model_frees_its_entity():
     env = dish(
         observation_space_mapping=lambda cell, size: [size], reward_mapping=lambda *, size: size
     )
@@ -276,7 +276,7 @@ def test_a_freed_argument_keeps_the_last_observation():
 
 
 @pytest.mark.parametrize("make_env", [aec_env, single_env])
-def test_an_environment_that_its_own_mapping_refers_to_is_freed(make_env):
+def test_env_is_garbage_collected_even_if_its_mapping_refers_to_it(make_env):
     def observe(holder, walk):
         return [walk.place, len(holder)]
 
@@ -295,7 +295,7 @@ def test_an_environment_that_its_own_mapping_refers_to_is_freed(make_env):
     assert session() is None
 
 
-def test_weakly_held_containers_keep_only_living_elements():
+def test_env_drops_freed_objects_from_containers_among_arguments():
     from simenv_marl.core.episodes.arguments import GONE, restore, weaken
 
     living, freed = Item(1), Item(2)
@@ -346,7 +346,7 @@ class Field(SimulationInterface):
                 self.choose(cell, np.full(3, size))
 
 
-def test_array_arguments_are_observed_with_their_current_values():
+def test_observation_shows_array_arguments_with_their_current_values():
     given = define(
         observation_space=spaces.Box(0, 9, (3,)),
         observation_space_mapping=lambda model, cell, field: field,
@@ -361,7 +361,7 @@ def pick(items):
     return items[0]
 
 
-def test_a_list_as_the_first_argument_is_held_weakly():
+def test_env_does_not_keep_objects_alive_that_a_list_argument_contains():
     class Picker(SimulationInterface):
         def reset(self, seed=None):
             self.freed = []
@@ -381,7 +381,7 @@ def test_a_list_as_the_first_argument_is_held_weakly():
     assert simulation.unwrapped.simulation.freed == [True, True]
 
 
-def test_set_that_the_model_keeps_is_read_with_later_changes():
+def test_last_observation_shows_later_changes_of_a_set_argument():
     from simenv_marl.core.episodes.arguments import restore, weaken
 
     held = {Item(1)}
@@ -391,7 +391,7 @@ def test_set_that_the_model_keeps_is_read_with_later_changes():
 
 
 @pytest.mark.parametrize("kind", [list, set, dict.fromkeys])
-def test_an_emptied_argument_keeps_the_last_observation(kind):
+def test_last_observation_stays_if_the_model_empties_a_list_argument(kind):
     class Shop(SimulationInterface):
         def reset(self, seed=None):
             self.jobs = kind(["mill", "drill"])

@@ -75,7 +75,7 @@ def call_of(tank, level):
         (lambda tank, *, _simulation: type(_simulation), Plant),
     ],
 )
-def test_a_mapping_gets_the_arguments_that_it_takes(mapping, expected):
+def test_mapping_gets_only_the_arguments_that_it_takes(mapping, expected):
     assert seen(mapping) == expected
 
 
@@ -88,7 +88,7 @@ def test_a_mapping_gets_the_arguments_that_it_takes(mapping, expected):
         (lambda tank, **named: named, {"flow": 8.0}),
     ],
 )
-def test_functions_with_open_arguments_pass_on_the_arguments_of_the_call(mapping, expected):
+def test_mapping_gets_all_arguments_of_a_decision_with_args_and_kwargs(mapping, expected):
     assert seen(mapping, OPEN) == expected
 
 
@@ -105,7 +105,7 @@ def test_functions_with_open_arguments_pass_on_the_arguments_of_the_call(mapping
 @pytest.mark.parametrize(
     "mapping", [lambda a, b, c, d: None, lambda tank, *, colour: None], ids=["places", "names"]
 )
-def test_a_mapping_that_requires_more_is_refused_at_construction(part, mapping):
+def test_env_refuses_a_mapping_with_more_parameters_than_the_decision(part, mapping):
     with pytest.raises(DefinitionError) as caught:
         aec_env(Plant, {TANK: define(**{part: mapping})})
     text = str(caught.value)
@@ -114,7 +114,7 @@ def test_a_mapping_that_requires_more_is_refused_at_construction(part, mapping):
     assert ("a, b, c, d" in text) or ("colour" in text)
 
 
-def test_an_argument_that_an_open_call_lacks_is_an_error_of_the_call():
+def test_missing_argument_of_a_decision_with_args_is_raised_by_reset():
     env = single_env(Plant, {OPEN: define(reward_mapping=lambda a, b, c, d, e: 0.0)})
     with pytest.raises(TypeError):
         env.reset(seed=1)
@@ -133,7 +133,7 @@ class Ward(SimulationInterface):
         self.log.append(self.treat(["ada", "bob"], 5))
 
 
-def test_action_and_item_come_before_the_arguments_of_the_call():
+def test_mapping_gets_action_and_split_item_before_other_arguments():
     env = begun(
         aec_env(
             Ward,

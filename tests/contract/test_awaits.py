@@ -132,7 +132,7 @@ TOGETHER = [
 # -- the order of events --------------------------------------------------------------------------
 
 
-def test_tasks_that_wait_are_asked_together_and_answered_in_order():
+def test_coroutine_policies_answer_decisions_of_asyncio_tasks_in_order():
     policy = counting(lambda number: 0.03 - 0.01 * number)  # the last one answers first
     assert played(speaking(policy)) == TOGETHER
     assert policy.ended == [2, 1, 0] * 2
@@ -141,7 +141,7 @@ def test_tasks_that_wait_are_asked_together_and_answered_in_order():
     assert [seen for _, seen, _ in policy.asked] == [1, 2, 3, 8, 9, 10]  # when each decision arose
 
 
-def test_the_rule_and_quick_policies_answer_at_once():
+def test_plain_policies_answer_decisions_of_asyncio_tasks_at_once():
     plain = Council()
     plain.reset()
     plain.run()
@@ -151,13 +151,13 @@ def test_the_rule_and_quick_policies_answer_at_once():
     assert quick[:4] == ["m0 asks", "m0 says 3", "m1 asks", "m1 says 3"]
 
 
-def test_rule_runs_when_a_coroutine_policy_answers_rule():
+def test_coroutine_policy_that_answers_rule_lets_the_models_rule_decide():
     log = played(speaking(tired))
     assert log[:3] == ["m0 asks", "m1 asks", "m2 asks"]
     assert log[3:7] == ["m0 rules", "m0 says 1", "m1 rules", "m1 says 1"]
 
 
-def test_quick_policies_answer_before_coroutine_policies():
+def test_plain_policies_answer_before_coroutine_policies():
     log = played({"m0": counting(), "m1": lambda observation: 3})
     assert log[:7] == [
         "m0 asks",
@@ -170,7 +170,7 @@ def test_quick_policies_answer_before_coroutine_policies():
     ]
 
 
-def test_all_runners_and_views_ask_in_the_same_order():
+def test_every_env_gets_decisions_of_asyncio_tasks_in_the_same_order():
     policies = speaking(counting(lambda number: 0.003 - 0.001 * number))
     given = {"points": POINTS}
     logs = simulate_many(Council, policies, seeds=range(5), collect=log_of, concurrency=2, **given)
@@ -195,13 +195,13 @@ def test_all_runners_and_views_ask_in_the_same_order():
     env.close()
 
 
-def test_rewards_are_computed_at_each_decision():
+def test_rewards_of_asyncio_tasks_are_computed_at_each_decision():
     found = collect_episodes(Council, speaking(counting()), seeds=[1], points=POINTS)
     (data,) = found.values()
     assert data.rewards.tolist() == [8.0, 14.0, 9.0, 14.0, 10.0, 14.0]
 
 
-def test_the_last_step_ends_the_episode_among_tasks_that_wait():
+def test_max_steps_end_an_episode_while_asyncio_tasks_wait():
     found = collect_episodes(
         Council,
         speaking(counting()),
@@ -227,7 +227,7 @@ class Steps(Council):
         self.log.append(f"chair: {await self.close_round()}")
 
 
-def test_each_event_loop_has_its_own_tasks():
+def test_model_that_makes_an_event_loop_per_step_gives_the_same_decisions():
     assert played(speaking(counting()), Steps) == TOGETHER
 
 
@@ -236,7 +236,7 @@ class Fifty(Council):
 
 
 @pytest.mark.parametrize("many", [1, 4])
-def test_fifty_tasks_wait_as_long_as_one(many):
+def test_fifty_asyncio_tasks_wait_for_coroutine_policies_as_long_as_one(many):
     policy = counting(lambda number: 0.05)
 
     async def patient(observation, *, _decision):
@@ -277,7 +277,7 @@ class Timed(Restless):
 
 
 @pytest.mark.parametrize("kind", [Polling, Timed])
-def test_polling_and_timed_models_get_the_answers_of_coroutines(kind):
+def test_asyncio_models_that_poll_or_sleep_work_with_coroutine_policies(kind):
     log = played(speaking(counting(lambda number: 0.05)), kind)
     if kind is Timed:  # its time was up while the answers came, but they were asked for first
         assert log.index("time is up") > log.index("m0 says 5")
@@ -295,7 +295,7 @@ class Impatient(Council):
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def test_a_task_that_the_model_cancels_is_not_asked():
+def test_coroutine_policy_is_not_asked_for_a_task_that_the_model_cancels():
     policy = counting()
     log = played(speaking(policy), Impatient)
     asks, says = TOGETHER[:3], ["m0 says 5", "m2 says 7"]
@@ -312,7 +312,7 @@ class Twins(Council):
         )
 
 
-def test_one_agent_in_two_tasks_that_wait_is_an_error():
+def test_agent_that_decides_in_two_asyncio_tasks_at_once_raises_an_error():
     with pytest.raises(AgentError, match="'m0' decides in two tasks that wait, one and two"):
         played(speaking(counting()), Twins)
 
@@ -320,7 +320,7 @@ def test_one_agent_in_two_tasks_that_wait_is_an_error():
 # -- what is asked, and how it is applied ---------------------------------------------------------
 
 
-def test_decision_of_a_coroutine_policy_keeps_its_initial_values():
+def test_coroutine_policy_keeps_the_observation_from_when_it_was_asked():
     shown = []
 
     async def reader(observation, *, _decision):
@@ -342,7 +342,7 @@ def test_decision_of_a_coroutine_policy_keeps_its_initial_values():
     assert log[3:6] == ["m0 says 1", "m1 says 2", "m2 says 3"]
 
 
-def test_apply_runs_in_the_task_when_the_answer_has_come():
+def test_apply_runs_in_the_asyncio_task_after_a_coroutine_policys_answer():
     async def apply(action, member, *, _rule):
         member.council.log.append(f"{member.name} applies {action}")
         return action + await _rule(member)
@@ -357,7 +357,7 @@ def test_apply_runs_in_the_task_when_the_answer_has_come():
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_recordings_repeat_the_order_without_asking(many, tmp_path):
+def test_recording_repeats_coroutine_policies_answers_without_asking(many, tmp_path):
     def run(policy):
         policy = FallbackPolicy(RecordedPolicy(policy, tmp_path / "answers"), tired)
         if many:
@@ -379,7 +379,7 @@ def test_recordings_repeat_the_order_without_asking(many, tmp_path):
     assert run(refuse) == first
 
 
-def test_clones_and_saved_files_with_waiting_tasks_continue_alike(tmp_path):
+def test_clones_and_saved_episodes_with_waiting_tasks_continue_alike(tmp_path):
     env = aec_env(Council, POINTS, policies=speaking(tired))
     env.reset(seed=1)
     env.step(4)
@@ -411,7 +411,7 @@ class Mixed(Council):
         self.log.append(f"chair: {await self.close_round()}")
 
 
-def test_a_user_is_asked_at_once_while_tasks_wait():
+def test_aec_env_asks_the_user_at_once_while_asyncio_tasks_wait():
     policies = speaking(FallbackPolicy(counting(), lambda observation: 9))
     env = aec_env(Mixed, POINTS, policies=policies)
     env.reset(seed=1)
@@ -428,7 +428,7 @@ def test_a_user_is_asked_at_once_while_tasks_wait():
         each.close()
 
 
-def test_an_episode_is_closed_while_tasks_wait():
+def test_env_can_be_closed_while_asyncio_tasks_wait():
     before = threading.active_count()
     env = aec_env(Mixed, POINTS, policies=speaking(counting()))
     env.reset(seed=1)
@@ -442,7 +442,7 @@ def test_an_episode_is_closed_while_tasks_wait():
 @pytest.mark.parametrize(
     ("answer", "error"), [(77, InvalidActionError), (ValueError("no"), ValueError)]
 )
-def test_first_wrong_answer_in_order_of_asking_is_raised(answer, error, many):
+def test_first_invalid_answer_of_coroutine_policies_is_raised(answer, error, many):
     async def wrong(observation, *, _decision):
         await asyncio.sleep(0.003 if _decision.agent == "m1" else 0)
         if _decision.agent == "m0":

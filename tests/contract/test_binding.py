@@ -6,7 +6,7 @@ from simenv_marl import RULE, parallel_env
 from tests.worlds.models import calling, decision
 
 
-def test_every_callable_gets_the_bound_arguments_of_calls_that_bind():
+def test_mappings_get_arguments_bound_to_the_decision_functions_signature():
     seen = {}
 
     def noting(name, value):

@@ -68,7 +68,7 @@ def comparing():
 
 
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
-def test_an_end_in_mid_episode_unwinds_past_the_c_code(trigger):
+def test_env_close_in_mid_episode_unwinds_a_model_called_from_c(trigger):
     log, decide, before = [], comparing(), stacks()
     env = begun(single_env(sorting(decide, log, stop=lambda: log.append("stop")), decide))
     env.step(1)
@@ -82,7 +82,7 @@ def test_an_end_in_mid_episode_unwinds_past_the_c_code(trigger):
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit, StopIteration])
-def test_an_error_in_a_callback_surfaces_from_step_as_itself(error):
+def test_error_in_a_callback_from_c_is_raised_by_env_step(error):
     def fail(one, other):
         if decide(one, other):
             raise error("in C")
@@ -96,14 +96,14 @@ def test_an_error_in_a_callback_surfaces_from_step_as_itself(error):
     assert log == ["finally"]
 
 
-def test_an_error_of_stop_surfaces_with_the_first_error():
+def test_error_of_a_stop_function_is_raised_with_the_callbacks_error():
     guard = CallbackGuard(stop=lambda: {}["cannot stop"])
     with pytest.raises(KeyError, match="cannot stop") as caught, guard:
         sort(guard.callback(lambda *_: 1 // 0))
     assert isinstance(caught.value.__context__, ZeroDivisionError)
 
 
-def test_after_an_error_c_gets_the_result_and_no_callback_runs():
+def test_c_code_gets_default_results_after_a_callback_has_failed():
     guard, answers = CallbackGuard(), []
     divide = guard.callback(lambda number: 1 // number, result=-1)
     with pytest.raises(ZeroDivisionError), guard:
@@ -114,7 +114,7 @@ def test_after_an_error_c_gets_the_result_and_no_callback_runs():
 
 
 @pytest.mark.parametrize("during", ["step", "close"])
-def test_interrupt_during_c_code_surfaces(during):
+def test_keyboard_interrupt_during_c_code_is_raised_by_env_step(during):
     def main(simulation):
         with guard:
             loops().loop_interrupted(EACH(guard.callback(decide)), 9, 1)

@@ -80,7 +80,7 @@ def of(what):
     return [seed for kind, seed in LOG if kind == what]
 
 
-def test_simulation_close_runs_before_the_next_reset_and_at_env_close():
+def test_simulation_close_is_called_before_each_reset_and_at_env_close():
     env = begun(single_env(Shop, BOOKS), 1)
     env.step(3)
     *_, terminated, _, _ = env.step(4)
@@ -102,7 +102,7 @@ def test_simulation_close_runs_before_the_next_reset_and_at_env_close():
 
 @pytest.mark.parametrize("shop", [Shop, Broken])
 @EVERY_VIEW
-def test_dropped_environment_closes_its_simulation_and_warns_of_errors(view, shop):
+def test_dropped_env_closes_its_simulation_and_warns_of_errors(view, shop):
     envs = [view(shop, BOOKS)]
     envs[0].reset(seed=1)
     with (
@@ -129,7 +129,7 @@ def test_vector_env_closes_each_simulation_before_its_next_reset(mode):
     assert len(of("close")) == len(of("reset")) == 4
 
 
-def test_runners_close_each_simulation_after_collect():
+def test_simulate_many_closes_each_simulation_after_collect():
     def collect(shop):
         assert shop.books is not None
         LOG.append(("collect", shop.seed))
@@ -149,7 +149,7 @@ def test_runners_close_each_simulation_after_collect():
     assert of("close") == of("reset") != []
 
 
-def test_error_in_close_does_not_replace_an_earlier_error():
+def test_error_in_simulation_close_does_not_replace_an_earlier_error():
     for run, policies in ((simulate, {BOOK: fail}), (evaluate, {"bad": {BOOK: fail}})):
         seed = {"seed": 1} if run is simulate else {"seeds": [1]}
         with fails(LookupError, "books cannot be closed", match="first"):

@@ -95,7 +95,7 @@ def made(shape, view, render_mode=None):
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES.keys())
-def test_pettingzoos_tests_pass(shape):
+def test_aec_and_parallel_envs_pass_pettingzoos_tests(shape):
     api_test(made(shape, "aec"), num_cycles=100)
     seed_test(partial(made, shape, "aec"), num_cycles=100)
     env = made(shape, "aec", "ansi")
@@ -110,7 +110,7 @@ def test_pettingzoos_tests_pass(shape):
 
 # of those who have not been called yet
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
-def test_pettingzoos_conversions_pass_its_tests():
+def test_envs_converted_between_aec_and_parallel_pass_pettingzoos_tests():
     api_test(parallel_to_aec(made(SHAPES["twice in a row"], "parallel")), num_cycles=20)
     parallel_api_test(
         turn_based_aec_to_parallel(aec_env(walk("ant", "bee"), [ANT, BEE])), num_cycles=20
@@ -136,7 +136,7 @@ def test_clones_pass_pettingzoos_and_gymnasiums_tests():
 # PettingZoo keeps a list of its own environments whose observations may be dicts.
 @pytest.mark.filterwarnings("ignore:Observation is not a NumPy array")
 @pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be")
-def test_pettingzoos_tests_pass_with_masks_in_observations():
+def test_envs_with_masks_in_observations_pass_pettingzoos_tests():
     seen = {
         "observation_space": spaces.Dict(
             {"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}
@@ -157,7 +157,7 @@ def test_pettingzoos_tests_pass_with_masks_in_observations():
 # all that there is to see of the absent
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @pytest.mark.parametrize("roster", ["unknown", "declared", "padded"])
-def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
+def test_envs_with_births_and_deaths_pass_pettingzoos_tests(roster):
     declared = {"possible_agents": {f"{HERE}.Creature.act": ROSTER[:6]}, "undeclared": "rule"}
     options = {} if roster == "unknown" else declared | {"state_space": "observations"}
 
@@ -179,7 +179,7 @@ def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
 
 
 @pytest.mark.filterwarnings("ignore:.*Illegal move made, game terminating")
-def test_illegal_actions_terminate_under_pettingzoos_wrapper():
+def test_pettingzoos_wrapper_terminates_an_env_after_an_illegal_action():
     env = wrappers.TerminateIllegalWrapper(aec_env(walk("bee", "cat"), [CAT]), illegal_reward=-1)
     env.reset(seed=1)
     while env.infos["cat_0"]["action_mask"][1]:
@@ -206,6 +206,6 @@ SINGLES = {
 # Render modes can be tested on registered environments alone.
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes")
 @pytest.mark.parametrize("shape", SINGLES.values(), ids=SINGLES.keys())
-def test_single_views_pass_gymnasiums_check_env(shape):
+def test_single_env_passes_gymnasiums_check_env(shape):
     check_env(made(shape, "single"))
     check_env(made(shape, "single", "ansi"))

@@ -69,7 +69,7 @@ def pairs(make, yard, points, options, seed):
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
 @examples(25)
 @given(design=yard_designs, seed=seeds, skip=st.booleans(), masked=st.booleans())
-def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
+def test_info_costs_are_summed_over_the_same_decisions_as_rewards(make, design, seed, skip, masked):
     options = {"skip_forced": skip}
     if make is not aec_env:
         options["possible_agents"] = YARD_ROSTER
@@ -77,7 +77,7 @@ def test_costs_are_summed_where_rewards_are(make, design, seed, skip, masked):
     assert [cost for _, cost in found] == pytest.approx([reward for reward, _ in found])
 
 
-def test_cost_belongs_to_the_previous_action():
+def test_info_cost_is_that_of_the_agents_previous_action():
     costs = iter([100, 1.5, 2.5])
     point = decision(agent="ant_0", cost_mapping=lambda: next(costs))
     env = single_env(calling(point, point), [point])
@@ -86,21 +86,21 @@ def test_cost_belongs_to_the_previous_action():
     assert [env.step(1)[4]["cost"] for _ in range(2)] == [1.5, 2.5]
 
 
-def test_without_a_mapping_no_info_has_a_cost():
+def test_info_has_no_cost_without_a_cost_mapping():
     point = decision(agent="ant_0")
     env = single_env(calling(point, point), [point])
     assert "cost" not in env.reset()[1]
     assert "cost" not in env.step(1)[4]
 
 
-def test_a_vector_has_an_array_of_costs():
+def test_vector_env_infos_have_an_array_of_costs():
     point = decision(agent="ant_0", cost_mapping=lambda: 2)
     env = vector_env(calling(point, point), points=[point], num_envs=3)
     env.reset(seed=1)
     assert env.step([1, 1, 1])[4]["cost"].tolist() == [2.0] * 3
 
 
-def test_a_cost_that_is_no_number_is_an_error():
+def test_cost_mapping_that_returns_no_number_raises_an_error():
     costs = iter([0, "dear"])
     point = decision(agent="ant_0", cost_mapping=lambda: next(costs))
     env = single_env(calling(point, point), [point])
@@ -109,12 +109,12 @@ def test_a_cost_that_is_no_number_is_an_error():
         env.step(1)
 
 
-def test_a_cost_mapping_must_be_callable():
+def test_make_step_refuses_a_cost_mapping_that_is_not_callable():
     with pytest.raises(DefinitionError, match="cost_mapping must be callable"):
         define(cost_mapping=1.0)
 
 
-def test_costs_of_freed_arguments_are_zero(recwarn):
+def test_last_cost_is_zero_if_the_model_has_freed_the_entity(recwarn):
     class Tree:
         pass
 

@@ -41,7 +41,7 @@ def ended_by(trigger, held):
 @EVERY_VIEW
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
-def test_early_end_unwinds_the_model_without_answering_decisions(view, trigger, max_steps):
+def test_env_close_and_reset_unwind_the_model_without_answering_decisions(view, trigger, max_steps):
     log, rewarded = [], []
 
     def main(simulation):
@@ -75,7 +75,7 @@ def test_early_end_unwinds_the_model_without_answering_decisions(view, trigger, 
     assert len(rewarded) == len(again)
 
 
-def test_exit_in_an_exception_group_unwinds_and_other_errors_surface():
+def test_env_close_unwinds_a_model_that_raises_an_exception_group():
     others = []
 
     def main(simulation):
@@ -110,7 +110,7 @@ def left(kind):
 
 
 @pytest.mark.thorough
-def test_thousands_of_aborted_episodes_leak_nothing():
+def test_env_leaks_nothing_after_thousands_of_aborted_episodes():
     draw = random.Random(5)
     driver = Options.__init__.__kwdefaults__["driver"]
     soak.play(driver, 200, draw)
@@ -127,7 +127,7 @@ def test_thousands_of_aborted_episodes_leak_nothing():
     "when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"]
 )
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
-def test_dropped_environment_unwinds_at_once_and_is_freed(view, when, where):
+def test_dropped_env_unwinds_its_model_at_once_and_is_freed(view, when, where):
     def main(simulation):
         witness = Witness()
         try:
@@ -167,7 +167,7 @@ def test_dropped_environment_unwinds_at_once_and_is_freed(view, when, where):
 @pytest.mark.usefixtures("_collected")
 @VIEWS
 @pytest.mark.parametrize("where", ["model", "mapping"])
-def test_errors_and_arguments_of_an_episode_are_not_kept_alive(view, where):
+def test_env_keeps_no_errors_or_arguments_of_an_episode_alive(view, where):
     def observe(witness):
         if where == "mapping" and env.simulation.log:
             raise RaisedError
@@ -211,7 +211,7 @@ def swallow_a_few(simulation):
 @VIEWS
 @TRIGGERS
 @pytest.mark.parametrize("main", [swallow_exceptions, swallow_a_few])
-def test_models_that_catch_the_exit_a_few_times_are_unwound(view, trigger, main):
+def test_env_close_unwinds_a_model_that_catches_its_exit_a_few_times(view, trigger, main):
     before = stacks()
     held = [view(script(main), decide)]
     held[0].reset()
@@ -224,7 +224,7 @@ def test_models_that_catch_the_exit_a_few_times_are_unwound(view, trigger, main)
 
 @VIEWS
 @pytest.mark.parametrize("trigger", ["close", "reset"])
-def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger):
+def test_env_close_warns_and_gives_up_a_model_that_does_not_unwind(view, trigger):
     stop = [False]
 
     def refuse(simulation):
@@ -250,7 +250,7 @@ def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger
     env.step(3)
 
 
-def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
+def test_dropped_env_reports_errors_that_its_model_raises_while_unwinding():
     def main(simulation):
         try:
             decide()
@@ -266,7 +266,7 @@ def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
 # -- threads --------------------------------------------------------------------------------------
 
 
-def test_an_environment_whose_thread_has_ended_can_be_reset_or_dropped():
+def test_env_can_be_reset_or_dropped_after_its_thread_has_ended():
     env = single_env(unwinding(decide, []), decide)
     in_a_thread(env.reset)
     env.reset()
@@ -292,7 +292,7 @@ def close_through_printing_c_code(path):
     Path(path).touch()
 
 
-def test_the_exit_does_not_end_a_process_whose_c_code_prints_it(tmp_path):
+def test_env_close_does_not_end_a_process_whose_c_code_prints_errors(tmp_path):
     alone(close_through_printing_c_code, str(tmp_path / "closed"))
     assert (tmp_path / "closed").exists()
 
@@ -321,14 +321,14 @@ def wrap(decide, how):
 
 @pytest.mark.parametrize("how", ["from it", "exit", "text", "later"])
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_error_caused_by_the_unwinding_exit_is_not_reported(how, end):
+def test_env_close_ignores_errors_that_the_models_exit_has_caused(how, end):
     decide = decision()
     env = begun(single_env(script(lambda simulation: wrap(decide, how)), decide))
     getattr(env, end)()
     env.close()
 
 
-def test_an_error_that_hides_the_exit_is_raised_by_close():
+def test_env_close_raises_an_error_that_replaces_the_models_exit():
     decide = decision()
     env = begun(single_env(script(lambda simulation: wrap(decide, "implicitly")), decide))
     with pytest.raises(EngineError):
@@ -358,7 +358,7 @@ class Engine:
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3])
-def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(steps):
+def test_env_reset_ignores_greenlets_kept_from_an_earlier_episode(steps):
     decide = decision()
     env = begun(single_env(partial(Engine, decide), decide))
     simulation = env.simulation

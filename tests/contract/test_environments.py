@@ -49,7 +49,7 @@ BOTH = calling(PUMP, FAN, PUMP)
         (PUMP, {"view": "aec"}, pettingzoo.AECEnv),
     ],
 )
-def test_generate_env_returns_a_class_of_a_view(points, options, base):
+def test_generate_env_returns_an_environment_class(points, options, base):
     env_class = generate_env(BOTH, points, **options)
     assert isinstance(env_class, type)
     assert issubclass(env_class, base)
@@ -59,7 +59,7 @@ def test_generate_env_returns_a_class_of_a_view(points, options, base):
 
 
 @EVERY_VIEW
-def test_environments_have_spaces_of_their_own(view):
+def test_environments_do_not_share_spaces(view):
     seeing, acting = spaces.Box(0, 1, (3,), np.float32), spaces.Discrete(4)
     pump = decision(observation_space=seeing, action_space=acting, agent="pump_0")
     env, other = (view(calling(pump), pump) for _ in range(2))
@@ -90,7 +90,7 @@ class Rendering(Script):
 
 
 @EVERY_VIEW
-def test_environments_have_metadata_and_a_generator(view):
+def test_envs_have_gymnasium_metadata_and_a_random_generator(view):
     plain = view(calling(PUMP), PUMP)
     assert (
         plain.metadata["render_fps"],
@@ -150,12 +150,12 @@ def test_environments_have_metadata_and_a_generator(view):
     ],
     ids=plainly,
 )
-def test_invalid_options_are_refused(make, options, error, match):
+def test_vector_env_refuses_invalid_options(make, options, error, match):
     with pytest.raises(error, match=match):
         make(BOTH, PUMP, **options)
 
 
-def test_invalid_views_are_refused():
+def test_generate_env_refuses_unknown_views():
     for view in ("", "AEC", 3):
         with pytest.raises(OptionValueError, match="view must be None"):
             generate_env(BOTH, PUMP, view=view)
@@ -164,7 +164,7 @@ def test_invalid_views_are_refused():
             generate_env(BOTH, points, view="single")
 
 
-def test_instances_may_change_the_options_of_their_class():
+def test_instances_of_a_generated_env_can_change_its_options():
     env_class = generate_env(BOTH, [PUMP, FAN], view="aec", max_steps=1)
     assert len(decisions(play(env_class()))) == 1
     assert len(decisions(play(env_class(max_steps=2)))) == 2
@@ -177,7 +177,7 @@ def test_instances_may_change_the_options_of_their_class():
 # -- max_steps ------------------------------------------------------------------------------------
 
 
-def test_max_steps_count_only_legal_actions_of_the_user():
+def test_max_steps_counts_only_legal_actions_of_the_user():
     env = begun(
         aec_env(
             calling(*[PUMP, FAN] * 5),
@@ -204,7 +204,7 @@ def test_max_steps_count_only_legal_actions_of_the_user():
     ("policy", "answer"),
     [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")],
 )
-def test_points_that_policies_answer_are_no_agents(key, policy, answer):
+def test_decision_points_with_a_policy_do_not_appear_as_agents(key, policy, answer):
     env = aec_env(BOTH, [PUMP, FAN], policies={key: policy})
     assert env.possible_agents == ["pump_0"]
     env.reset()
@@ -229,7 +229,7 @@ def first_legal(observation, info=None):
         (len, 2),
     ],
 )
-def test_policies_take_the_observation_or_observation_and_info(policy, answer):
+def test_policies_take_an_observation_and_optionally_an_info(policy, answer):
     masks = {"action_mask_mapping": lambda: [0] * 3 + [1] * 7} if answer == 3 else {}
     decide = decision(agent="decider_0", **masks)
     env = aec_env(calling(decide, PUMP), [decide, PUMP], policies={"decider_0": policy})
@@ -237,7 +237,7 @@ def test_policies_take_the_observation_or_observation_and_info(policy, answer):
     assert env.simulation.log == [answer, 1]
 
 
-def test_a_policys_action_is_checked_and_mapped():
+def test_env_checks_and_maps_the_actions_of_policies():
     fan = decision(agent="fan_0", action_space_mapping=lambda action: ("mapped", action))
     env = aec_env(calling(fan, PUMP), [fan, PUMP], policies={fan: lambda observation: np.int64(3)})
     play(env, 1)
@@ -248,7 +248,7 @@ def test_a_policys_action_is_checked_and_mapped():
     env.reset()
 
 
-def test_policies_may_be_given_for_agents_that_a_callable_names():
+def test_policies_can_be_given_for_agents_named_by_a_callable():
     calls = calling(
         *[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "herd.1", "c")]
     )
@@ -260,7 +260,7 @@ def test_policies_may_be_given_for_agents_that_a_callable_names():
 # -- agents ---------------------------------------------------------------------------------------
 
 
-def test_points_of_one_agent_must_have_equal_spaces_and_one_policy():
+def test_decision_points_of_an_agent_need_equal_spaces_and_one_policy():
     few = {"agent": lambda: "pump_0", "action_space": spaces.Discrete(3)}
     named, other = decision(**few), decision(agent=lambda: "pump_0")
     for first, second in ((PUMP, named), (named, other)):
@@ -303,7 +303,7 @@ class Housed(Script):
 @pytest.mark.parametrize(
     "source", [Housed, lambda: Housed(), Housed()], ids=["class", "factory", "instance"]
 )
-def test_a_point_that_is_named_has_the_simulations_own_definition(source):
+def test_decision_point_given_by_name_has_the_simulations_definition(source):
     for named in (f"{__name__}.Hut.heat", [Hut.heat]):
         env = begun(single_env(source, named))
         env.step(3)

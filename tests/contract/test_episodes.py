@@ -22,6 +22,7 @@ from tests.worlds.models import (
     follow_the_rule,
     play,
     script,
+    step,
 )
 from tests.worlds.vectors import same
 
@@ -41,7 +42,7 @@ NESTED = spaces.Dict({"row": ROW, "parts": spaces.Tuple((spaces.Discrete(2), spa
     ids=str,
 )
 @VIEWS
-def test_observations_that_do_not_fit_are_errors(view, space, value, at):
+def test_env_raises_an_error_for_observations_outside_their_space(view, space, value, at):
     observed = [*[space.sample()] * at, value]
     decide = decision(observation_space=space, observation_space_mapping=lambda: observed.pop(0))
     env = view(calling(decide, decide), decide)
@@ -78,9 +79,7 @@ KINDS = {
 
 @pytest.mark.parametrize(("space", "observe", "expected"), KINDS.values(), ids=KINDS)
 @VIEWS
-def test_observations_are_never_shared_between_calls_or_with_the_model(
-    view, space, observe, expected
-):
+def test_env_observations_share_no_memory_with_the_model(view, space, observe, expected):
     array = np.array([5, 6, 7, 8], np.float32)
     parts = {"row": array, "parts": [1, "abc"]}
     decide = decision(
@@ -128,7 +127,7 @@ HOLDERS = {
 
 
 @pytest.mark.parametrize("place", HOLDERS)
-def test_an_array_with_one_reference_to_it_is_copied(place):
+def test_env_copies_an_observed_array_that_only_the_model_refers_to(place):
     observe = HOLDERS[place](np.array([1.0, 2.0]))
     decide = decision(observation_space_mapping=observe)
     env = single_env(calling(decide, decide), decide)
@@ -137,7 +136,7 @@ def test_an_array_with_one_reference_to_it_is_copied(place):
     assert observe().tolist() == [1.0, 2.0]
 
 
-def test_observations_are_computed_at_each_decision_and_at_the_end():
+def test_env_computes_observations_at_each_decision_and_at_the_end():
     program = (
         "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health"
         " 6, 1 health 5, 2 forgotten"
@@ -160,7 +159,7 @@ def test_observations_are_computed_at_each_decision_and_at_the_end():
     assert ended == {"being_0": ([0, 6], 6.0), "being_1": ([1, 5], 5.0), "being_2": ([2, 0], 0.0)}
 
 
-def test_agent_observes_values_nearest_zero_before_its_first_decision():
+def test_observation_before_an_agents_first_decision_is_nearest_to_zero():
     dials = spaces.MultiDiscrete([2, 2], start=[-5, -1])
     parts = spaces.Tuple([dials, spaces.MultiBinary(2)])
     space = spaces.Dict(a=spaces.Box(1, 2, (1,)), b=spaces.Discrete(3, start=-9), c=parts)
@@ -196,7 +195,7 @@ def test_agent_observes_values_nearest_zero_before_its_first_decision():
         (10**400, "too large"),
     ],
 )
-def test_rewards_are_finite_python_floats(view, before, paid, told):
+def test_env_rewards_are_finite_python_floats(view, before, paid, told):
     rewards = iter([None, *[1.0] * before, paid, 1.0, 1.0])  # the first one is discarded
     decide = decision(agent="ant_0", reward_mapping=lambda: next(rewards))
     env = view(calling(decide, decide, decide), decide)
@@ -231,7 +230,7 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
     ids=str,
 )
 @VIEWS
-def test_rule_and_samples_of_the_space_are_legal_actions(view, space):
+def test_env_accepts_the_rule_constant_and_samples_as_actions(view, space):
     decide = decision(action_space=space, agent="a_0", action_space_mapping=lambda action: "sample")
     env = begun(view(calling(*[decide] * 6), decide), 1)
     env.step(RULE)
@@ -247,7 +246,7 @@ def test_rule_and_samples_of_the_space_are_legal_actions(view, space):
 @pytest.mark.parametrize("choices", [None, lambda being: [1, 2, 3]], ids=["no choices", "choices"])
 @pytest.mark.parametrize("actions", [RULE, 0, 1])
 @pytest.mark.parametrize("policy", [None, RULE, lambda *_: 1], ids=["no policy", "rule", "policy"])
-def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices, actions, policy):
+def test_env_keeps_no_entity_alive_that_the_model_has_dropped(choices, actions, policy):
     def main(simulation):
         herd = [Being(number) for number in range(3)]
         watched = [weakref.ref(being) for being in herd]
@@ -300,7 +299,7 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
     ids=str,
 )
 @VIEWS
-def test_illegal_actions_raise_and_leave_the_environment_unchanged(view, space, legal, illegal):
+def test_env_is_unchanged_after_it_refuses_an_illegal_action(view, space, legal, illegal):
     moved = []
     decide = decision(
         action_space=space,
@@ -308,12 +307,12 @@ def test_illegal_actions_raise_and_leave_the_environment_unchanged(view, space, 
         action_space_mapping=lambda action: moved.append(action) or "done",
     )
     env = begun(view(calling(decide, decide), decide), 3)
-    for step, right in enumerate(legal):
+    for number, right in enumerate(legal):
         for action in illegal:
             before = env.last() if view is aec_env else None
             with pytest.raises(InvalidActionError, match="a_0"):
                 env.step(action)
-            assert len(moved) == len(env.simulation.log) == step
+            assert len(moved) == len(env.simulation.log) == number
             if view is aec_env:
                 assert env.agent_selection == "a_0"
                 after = env.last()
@@ -324,3 +323,13 @@ def test_illegal_actions_raise_and_leave_the_environment_unchanged(view, space, 
             np.asarray(moved[-1]), np.asarray(right).astype(space.dtype or object)
         )
     assert env.simulation.log == ["done", "done"]
+
+
+@EVERY_VIEW
+def test_env_continues_after_it_has_refused_a_masked_action(view):
+    ant = decision(agent="ant_0", action_mask_mapping=lambda: [1] * 9 + [0])
+    env = begun(view(calling(ant, ant), ant))
+    with pytest.raises(InvalidActionError, match="masked"):
+        step(env, 9, "ant_0")
+    step(env, 4, "ant_0")
+    assert env.simulation.log == [4]

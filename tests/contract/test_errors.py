@@ -63,7 +63,7 @@ BUILTINS = {
 }
 
 
-def test_all_errors_are_public_survive_pickling_and_have_one_root():
+def test_all_error_classes_are_public_survive_pickling_and_have_one_base():
     assert len(LEAVES) > 10
     assert SimEnvError.__mro__ == (SimEnvError, Exception, BaseException, object)
     for error in LEAVES:
@@ -86,7 +86,7 @@ def test_all_errors_are_public_survive_pickling_and_have_one_root():
 
 
 @pytest.mark.parametrize("view", [aec_env, single_env])
-def test_use_before_reset_after_the_end_or_after_close_is_refused(view):
+def test_env_refuses_steps_before_reset_after_the_end_and_after_close(view):
     def refuses(kind, match, *uses):
         for use in (*uses, *uses):
             with pytest.raises(kind, match=match):
@@ -118,7 +118,7 @@ def test_use_before_reset_after_the_end_or_after_close_is_refused(view):
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_the_model_may_catch_the_errors_of_its_own_rule_and_of_apply(action):
+def test_model_can_catch_errors_of_its_own_rule_and_of_apply(action):
     def main(simulation):
         for _ in range(2):
             try:
@@ -144,7 +144,7 @@ def test_the_model_may_catch_the_errors_of_its_own_rule_and_of_apply(action):
 @pytest.mark.greenlet("threads of their own may be used from any other")
 @EVERY_VIEW
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-def test_environment_refuses_use_from_another_thread_and_stays_intact(what, view):
+def test_env_refuses_use_from_another_thread_and_stays_intact(what, view):
     unwound = []
 
     def main(simulation):
@@ -214,13 +214,13 @@ unwieldy = pytest.mark.parametrize("make", UNWIELDY.values(), ids=UNWIELDY)
 
 
 @unwieldy
-def test_short_repr_limits_the_length_of_any_value(make):
+def test_error_messages_shorten_long_values(make):
     assert 0 < len(short_repr(make())) <= LONGEST
     assert len(short_repr(make(), 60)) <= 60
     short_repr(make()).encode()
 
 
-def test_short_repr_leaves_short_values_and_errors_unchanged():
+def test_error_messages_show_short_values_unchanged():
     for value in (
         1.5,
         "text",
@@ -236,7 +236,7 @@ def test_short_repr_leaves_short_values_and_errors_unchanged():
 
 @unwieldy
 @EVERY_VIEW
-def test_error_for_an_unwieldy_action_is_short(view, make):
+def test_error_for_a_huge_action_is_short(view, make):
     decide = decision(action_space=spaces.MultiDiscrete([3, 3]))
     env = begun(view(calling(decide), decide), 1)
     with pytest.raises(InvalidActionError) as caught:
@@ -254,7 +254,7 @@ def test_error_for_an_unwieldy_action_is_short(view, make):
         ("agent", AgentError),
     ],
 )
-def test_invalid_results_of_mappings_are_refused_with_short_messages(name, error, make):
+def test_env_refuses_invalid_results_of_mappings_with_short_messages(name, error, make):
     if name == "agent" and isinstance(make(), str):
         return  # which is a name
     decide = decision(**{name: lambda: make()})
@@ -266,7 +266,7 @@ def test_invalid_results_of_mappings_are_refused_with_short_messages(name, error
 
 
 @pytest.mark.usefixtures("_collected")
-def test_error_without_a_repr_does_not_hide_the_first_error():
+def test_model_error_whose_repr_fails_does_not_hide_the_first_error():
     """It is raised while the simulation is unwound for another."""
 
     def main(simulation):
@@ -282,7 +282,7 @@ def test_error_without_a_repr_does_not_hide_the_first_error():
 
 
 @pytest.mark.parametrize("given", ["text", 3, None, ("one",), {}, [3], Broken()])
-def test_error_with_malformed_notes_surfaces_unchanged(given):
+def test_env_step_raises_a_model_error_with_malformed_notes_unchanged(given):
     def fail(*_):
         error.__notes__ = given
         raise error

@@ -97,7 +97,7 @@ def play_and_cut_short(env):
 
 @pytest.mark.thorough
 @everywhere(*VIEWS)
-def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
+def test_env_raises_any_model_error_unchanged_and_resets_cleanly(view, place):
     before = stacks()
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
@@ -160,7 +160,7 @@ def test_any_model_error_surfaces_unchanged_and_leaves_no_trace(view, place):
     ],
 )
 @pytest.mark.parametrize("seed", [31, None])  # None: it is drawn
-def test_error_note_names_decision_agent_and_seed(view, place, time, where, seed):
+def test_env_error_note_names_decision_point_agent_and_seed(view, place, time, where, seed):
     env, farm = farm_env(view, place)
     farm.let(partial(throw, ValueError("told")), place, time)
     with pytest.raises(ValueError, match="told") as caught:
@@ -183,7 +183,7 @@ INSIDE = [place for place in faults.PLACES if place != "render"]  # which comes 
 @pytest.mark.thorough
 @everywhere(*VIEWS, faults.vector, faults.vector_of_joint, places=INSIDE)
 @pytest.mark.parametrize("method", ["step", "reset", "close"])
-def test_reentrant_use_is_refused_and_the_episode_continues(view, place, method):
+def test_env_refuses_a_step_within_a_step_and_the_episode_continues(view, place, method):
     def use():
         take(env, 0) if method == "step" else getattr(env, method)()
 
@@ -274,7 +274,7 @@ def interrupt_at(number, function, *args):
 
 @pytest.mark.thorough
 @EVERY_VIEW
-def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
+def test_keyboard_interrupt_anywhere_is_raised_and_the_next_episode_works(view):
     # In a process of its own: where greenlets were interrupted amid a switch, the collector may
     # crash later.
     alone(interrupt_anywhere, view.__name__)
@@ -327,7 +327,7 @@ USES = {
 @pytest.mark.thorough
 @pytest.mark.greenlet("the release is the same with every driver")
 @pytest.mark.parametrize("use", USES)
-def test_interrupt_while_opening_or_closing_leaves_nothing_patched(use):
+def test_keyboard_interrupt_in_env_creation_or_close_leaves_no_patches(use):
     alone(interrupt_what_opens_and_closes, use)  # as above
 
 
@@ -362,7 +362,7 @@ def deep_down(function, room):
 
 @pytest.mark.usefixtures("_collected")
 @EVERY_VIEW
-def test_an_environment_survives_the_end_of_its_users_stack(view):
+def test_env_works_after_a_recursion_error_in_the_users_code(view):
     env, ends = view(Model, decide), set()
     for room in range(1, 60):
         env.reset()

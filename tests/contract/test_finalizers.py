@@ -60,7 +60,7 @@ class Circular(Plant):
 
 
 @pytest.mark.parametrize("kind", [Plant, Circular])
-def test_process_finalized_by_another_episode_runs_its_rule(kind):
+def test_decision_of_a_freed_generator_never_reaches_another_env(kind):
     ABANDONED.clear()
     first = single_env(kind, POINTS)
     second = single_env(kind, POINTS)

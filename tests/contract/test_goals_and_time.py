@@ -86,7 +86,7 @@ def goals(**changes):
     return {Walk.walk: define(**GOAL | changes)}
 
 
-def test_goal_based_observations_are_dicts_of_the_users_own():
+def test_goal_observations_are_new_dicts_at_each_step():
     env = single_env(Walk, goals())
     assert isinstance(env.observation_space, spaces.Dict)
     assert set(env.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
@@ -116,7 +116,7 @@ def test_goal_based_observations_are_dicts_of_the_users_own():
     assert joint_env(Walk, goals()).observation_space["walker_0"] == GOAL["observation_space"]
 
 
-def test_mappings_of_goals_take_as_many_arguments_as_they_want():
+def test_goal_mappings_take_only_the_arguments_they_want():
     env = single_env(
         Walk,
         goals(
@@ -130,7 +130,7 @@ def test_mappings_of_goals_take_as_many_arguments_as_they_want():
     assert first["desired_goal"].tolist() == env.simulation.goal.tolist()
 
 
-def test_rewards_are_computed_anew_for_other_goals():
+def test_compute_reward_gives_rewards_for_other_goals():
     env = begun(single_env(Walk, goals()), 3)
     observations, rewards, _, truncations, infos = zip(
         *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
@@ -157,7 +157,7 @@ def test_rewards_are_computed_anew_for_other_goals():
         ({"compute_reward": 3}, "compute_reward must be callable"),
     ],
 )
-def test_incomplete_goals_and_goals_outside_their_space_are_refused(changes, match):
+def test_make_step_refuses_incomplete_goals_and_goals_outside_their_space(changes, match):
     with pytest.raises(DefinitionError, match=match):
         goals(**changes)
     with pytest.raises(ObservationError, match="its space Box"):
@@ -190,7 +190,7 @@ def test_goal_observations_keep_the_action_mask_in_observation_and_info():
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def test_masks_on_request_are_flat_and_pass_through_wrappers():
+def test_action_masks_method_returns_flat_masks_through_wrappers():
     """The method that sb3-contrib's MaskablePPO calls before each step."""
     legal = iter([([1, 0], [0, 1, 1]), ([0, 1], [1, 0, 0]), ([1, 1], [1, 1, 1])])
     parts = spaces.MultiDiscrete([2, 3])
@@ -244,7 +244,7 @@ MASKED = {"action_mask_mapping": lambda: ONE_MASK}
     ],
     ids=["a mask", "choices", "a mask of several parts"],
 )
-def test_masked_actions_are_illegal_in_every_view(view, changes, mask, illegal, legal, log):
+def test_every_env_refuses_masked_actions(view, changes, mask, illegal, legal, log):
     ant = decision(agent="ant_0", **changes)
     env = view(calling(ant, ant), ant)
     result = env.reset(seed=1)
@@ -267,7 +267,7 @@ def test_masked_actions_are_illegal_in_every_view(view, changes, mask, illegal, 
     assert env.simulation.log == log
 
 
-def test_action_mask_in_the_models_observation_does_not_mask_actions():
+def test_model_observation_named_action_mask_does_not_mask_actions():
     space = spaces.Dict({"action_mask": spaces.MultiBinary(10)})
     own = {
         "observation_space": space,
@@ -307,7 +307,7 @@ def times(turns, agent):
     return [(turn.info["time"], turn.info["elapsed"]) for turn in turns if turn.agent == agent]
 
 
-def test_infos_of_expected_and_of_ended_agents_have_their_times():
+def test_infos_of_agents_before_and_after_their_decisions_have_their_times():
     program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
     env = begun(
         aec_env(
@@ -326,7 +326,7 @@ def test_infos_of_expected_and_of_ended_agents_have_their_times():
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
 
 
-def test_rounds_have_the_time_of_the_simulation():
+def test_parallel_env_infos_have_the_simulation_time():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
     *_, infos = env.reset()
@@ -350,7 +350,7 @@ def test_rounds_have_the_time_of_the_simulation():
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_get_time_elapsed_and_discount_in_infos(action):
+def test_policies_get_time_elapsed_time_and_discount_in_infos(action):
     """Since the decision before, whether the policy has taken that or left it to the rule."""
     ant, seen = decision(agent="ant_0"), []
 
@@ -380,7 +380,7 @@ def told(env):
 
 @EVERY_VIEW
 @pytest.mark.parametrize("rate", [0.25, 0, None])
-def test_infos_have_time_elapsed_and_discount_in_every_view(view, rate):
+def test_infos_have_time_elapsed_time_and_discount_in_every_env(view, rate):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
     env = view(clock, ant, discount_rate=rate)
@@ -398,7 +398,7 @@ def test_infos_have_time_elapsed_and_discount_in_every_view(view, rate):
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
-def test_invalid_discount_rates_are_refused(rate):
+def test_envs_refuse_invalid_discount_rates(rate):
     with pytest.raises(
         OptionValueError,
         match="discount_rate must be a finite number that is not negative, or None",
@@ -410,7 +410,7 @@ def test_invalid_discount_rates_are_refused(rate):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
+def test_env_infos_have_the_same_keys_from_reset_to_the_end(make):
     """There are learners that ask for them once and for all."""
     ant, bee, elk = (
         decision(agent="ant_0", **MASKED),
@@ -437,7 +437,7 @@ def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
     assert all(info.keys() == expected[agent] for agent, info in infos.items())
 
 
-def test_action_mask_is_open_before_the_first_decision_of_an_agent():
+def test_action_mask_allows_all_actions_before_an_agents_first_decision():
     ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
     env = begun(aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk]))
     env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
@@ -452,7 +452,7 @@ def test_action_mask_is_open_before_the_first_decision_of_an_agent():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_mask_in_an_observation_without_a_decision_is_all_ones(make):
+def test_action_mask_in_an_observation_without_a_decision_is_all_ones(make):
     """A mask of zeros would leave a policy nothing to choose from."""
     seen = spaces.Dict(
         observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10)
@@ -532,7 +532,7 @@ def test_env_state_is_a_copy_of_the_simulation_state_cast_to_its_space(view):
     assert env.state() in env.state_space
 
 
-def test_invalid_states_are_refused():
+def test_env_state_refuses_invalid_results_of_the_simulation():
     ant = decision(agent="ant_0")
     for make, options, error, match in (
         (
@@ -557,7 +557,7 @@ def test_invalid_states_are_refused():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_state_may_be_the_concatenated_observations(make):
+def test_env_state_can_be_the_concatenated_observations(make):
     ant = decision(agent="ant_0", observation_space=spaces.Box(0, 9, (2,), np.float32))
     bee = decision(
         agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 2
@@ -589,7 +589,7 @@ def test_state_may_be_the_concatenated_observations(make):
 
 
 @EVERY_VIEW
-def test_render_returns_frames_of_the_simulation_in_its_modes(view, capsys):
+def test_env_render_returns_frames_of_the_simulation_in_its_modes(view, capsys):
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
         view(lambda: Counted(ant), ant, render_mode=mode)
@@ -621,7 +621,7 @@ def test_render_returns_frames_of_the_simulation_in_its_modes(view, capsys):
     "make", [aec_env, parallel_env, single_env, lambda *of, **to: vector_env(*of, num_envs=1, **to)]
 )
 @pytest.mark.parametrize("mode", ["human", "rgb_array", "rgb_array_list"])
-def test_a_mode_that_the_simulation_lacks_is_a_warning(make, mode):
+def test_env_warns_of_a_render_mode_that_the_simulation_lacks(make, mode):
     ant = decision(agent="ant_0")
     with pytest.warns(
         UserWarning, match=f"render_mode '{mode}' is not one of the simulation's .it has none."
@@ -635,7 +635,7 @@ def first_numbers(frames):
 
 
 @pytest.mark.parametrize("registered_as", ["a simulation", "a function"])
-def test_rgb_array_list_has_frames_since_the_last_reset_or_render(registered_as):
+def test_env_render_rgb_array_list_returns_frames_since_the_last_render(registered_as):
     ant = decision(agent="ant_0")
     with registries_put_back():
         if registered_as == "a simulation":
@@ -658,7 +658,7 @@ def test_rgb_array_list_has_frames_since_the_last_reset_or_render(registered_as)
     assert [first_numbers(frames) for frames in envs.render()] == [[0, 4], [0, 5]]
 
 
-def test_a_clock_that_each_reset_sets_anew_is_read():
+def test_info_time_uses_a_time_method_that_reset_replaces():
     class Shift:
         def reset(self, seed=None):
             self.time = partial(float, seed)

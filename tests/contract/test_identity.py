@@ -58,7 +58,7 @@ def made(view, design, **options):
 
 @given(yard_designs, seeds, OPTIONS)
 @examples(150)
-def test_every_view_stepped_with_rule_matches_the_plain_run(design, seed, options):
+def test_every_env_with_rule_actions_runs_like_the_model_without_env(design, seed, options):
     expected = yard_outcome(plain_yard(design, seed))
     for view in VIEWS:
         env = made(view, design, **options)
@@ -168,7 +168,7 @@ uses = st.lists(
     yard_designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses
 )
 @examples(120)
-def test_environments_in_random_use_do_not_affect_each_other(design, kinds, sequence):
+def test_envs_used_in_random_order_do_not_affect_each_other(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:
         player = players[which]

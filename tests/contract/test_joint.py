@@ -37,7 +37,7 @@ BOX = {
 # -- dicts ----------------------------------------------------------------------------------------
 
 
-def test_joint_spaces_are_dicts_keyed_by_agent():
+def test_joint_env_spaces_are_dicts_keyed_by_agent():
     ant, bee, cat = points(
         3, action_space=spaces.Discrete(10), observation_space=spaces.Box(-9, 9, (2,))
     )
@@ -59,7 +59,7 @@ def test_joint_spaces_are_dicts_keyed_by_agent():
     assert env.simulation.log == [1, 7, 2]
 
 
-def test_joint_action_illegal_at_its_turn_counts_as_missing():
+def test_joint_env_ignores_an_action_that_is_illegal_at_its_agents_turn():
     mask = np.array([1] * 3 + [0] * 7, np.int8)
     ant, cat = decision(agent="ant_0", action_mask_mapping=lambda: mask), decision(agent="cat_0")
     bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
@@ -77,7 +77,7 @@ def test_joint_action_illegal_at_its_turn_counts_as_missing():
 
 
 @pytest.mark.parametrize("max_steps", [None, 2])
-def test_joint_step_answers_one_decision_of_each_agent(max_steps):
+def test_joint_env_step_answers_one_decision_of_each_agent(max_steps):
     ant, bee = points(reward_mapping=lambda: 1.5)
     calls = [ant, bee] * (2 if max_steps is None else 9)
     env = joint_env(calling(*calls), [ant, bee], max_steps=max_steps)
@@ -115,7 +115,7 @@ def test_joint_step_answers_one_decision_of_each_agent(max_steps):
     ],
     ids=repr,
 )
-def test_refused_joint_action_leaves_the_environment_unchanged(flatten, action, match):
+def test_joint_env_is_unchanged_after_it_refuses_an_action(flatten, action, match):
     paid, seen = [], []
     changes = BOX | {"action_space_mapping": lambda action: seen.append(action) or float(action[0])}
     ant, bee = points(reward_mapping=lambda: paid.append(0) or 1.0, **changes)
@@ -148,7 +148,7 @@ PACK = (
 NAMES = ["being_0", "being_1", "being_2"]
 
 
-def test_the_roster_is_declared_or_asked_of_the_simulation():
+def test_joint_env_takes_agents_from_possible_agents_or_the_simulation():
     declared = joint_env(life(PACK), beings(), possible_agents=[*NAMES, "being_3"])
     announced = joint_env(life(PACK, announced=range(3)), beings())
     for env, seen in (
@@ -161,7 +161,7 @@ def test_the_roster_is_declared_or_asked_of_the_simulation():
         assert {name: part.tolist() for name, part in observation.items()} == seen
 
 
-def test_ended_agents_keep_their_last_observation_and_get_no_reward():
+def test_joint_env_keeps_ended_agents_last_observation_without_reward():
     env = joint_env(life(PACK, announced=range(3)), beings())
     env.reset()
     action = {"being_0": 5, "being_1": 6, "being_2": 7}
@@ -185,7 +185,7 @@ def test_ended_agents_keep_their_last_observation_and_get_no_reward():
 @pytest.mark.parametrize(
     "make", [joint_env, partial(vector_env, num_envs=2)], ids=["one", "vector"]
 )
-def test_a_roster_that_is_not_known_is_refused(make):
+def test_joint_env_refuses_a_model_whose_agents_are_unknown(make):
     for program in ("0 whole 1", PACK):
         with pytest.raises(
             ViewError,
@@ -196,7 +196,7 @@ def test_a_roster_that_is_not_known_is_refused(make):
         joint_env(life("0 whole 1", announced=[]), beings())
 
 
-def test_asking_for_the_roster_leaves_nothing_behind():
+def test_joint_env_unwinds_the_trial_run_in_which_it_finds_its_agents():
     being, log = Being(0), []
 
     def announcing():
@@ -214,7 +214,7 @@ def test_asking_for_the_roster_leaves_nothing_behind():
 # -- flattened ------------------------------------------------------------------------------------
 
 
-def test_flattened_spaces_are_boxes():
+def test_joint_env_with_flatten_has_box_spaces():
     functions = [
         decision(
             agent=f"{name}_0",
@@ -238,7 +238,7 @@ def test_flattened_spaces_are_boxes():
     assert info == {"deciding": "ant_0", "acted": dict.fromkeys(["ant_0", "bee_0", "cat_0"], True)}
 
 
-def test_flattened_discrete_spaces_have_one_mask():
+def test_joint_env_with_flatten_has_one_mask_for_all_discrete_spaces():
     ant = decision(
         agent="ant_0",
         action_space=spaces.MultiDiscrete([2, 3]),
@@ -292,7 +292,7 @@ def test_flattened_discrete_spaces_have_one_mask():
     ],
     ids=["matrix of numbers", "matrix", "bits"],
 )
-def test_flatten_refuses_unsuitable_spaces_and_views(of_ant, of_bee, match):
+def test_flatten_refuses_unsuitable_spaces_and_environments(of_ant, of_bee, match):
     ant, bee = decision(agent="ant_0", **of_ant), decision(agent="bee_0", **of_bee)
     with pytest.raises(ViewError, match=match):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
@@ -301,7 +301,7 @@ def test_flatten_refuses_unsuitable_spaces_and_views(of_ant, of_bee, match):
             make(calling(ant, bee), [ant, bee], flatten=True)
 
 
-def test_flattened_discrete_action_is_the_largest_legal_preference():
+def test_flattened_action_chooses_the_legal_action_with_the_largest_value():
     mask = np.array([0, 1, 1], np.int8)
     ant = decision(
         agent="ant_0",
@@ -332,9 +332,9 @@ def test_flattened_discrete_action_is_the_largest_legal_preference():
             calling(*(pair := points(**BOX)) * 20), pair, view="joint", flatten=True
         )(),
     ],
-    ids=["deaths and a roster", "flattened"],
+    ids=["deaths and possible agents", "flattened"],
 )
-def test_joint_view_passes_gymnasiums_check_env(make):
+def test_joint_env_passes_gymnasiums_check_env(make):
     env = make()
     check_env(env, skip_render_check=True)
     drawn = []

@@ -97,7 +97,7 @@ def steps_of(env):
         (single_env, {"agent": "sheep_0"}, 3),
     ],
 )
-def test_an_episode_ends_with_the_last_agent_of_its_roster(view, options, steps, kind):
+def test_episode_ends_when_all_possible_agents_have_ended(view, options, steps, kind):
     env = view(kind, POINTS[kind], max_steps=500, **options)
     for _ in range(2):
         assert steps_of(env) == steps
@@ -105,19 +105,19 @@ def test_an_episode_ends_with_the_last_agent_of_its_roster(view, options, steps,
     env.close()
 
 
-def test_a_dead_agent_is_gone_from_the_model_when_the_episode_ends():
+def test_single_env_runs_the_models_removal_before_the_episode_ends():
     env = single_env(Meadow, POINTS[Meadow], agent="sheep_1", max_steps=500)
     steps_of(env)
     assert "sheep_1" not in [sheep.name for sheep in env.simulation.living]
 
 
-def test_a_simulation_without_a_limit_of_steps_runs_to_its_end():
+def test_parallel_env_without_max_steps_runs_the_simulation_to_its_end():
     env = parallel_env(Meadow, POINTS[Meadow], possible_agents=SHEEP)
     steps_of(env)
     assert env.simulation.years == 1000
 
 
-def test_apply_that_runs_the_rule_sets_no_rule_action_in_info():
+def test_info_has_no_rule_action_if_apply_itself_calls_the_rule():
     fill = decision(lambda: 3, apply=lambda action: fill() + action, rule_action_mapping=int)
     env = begun(single_env(calling(*[fill] * 4), fill))
     infos = [env.step(action)[4] for action in (1, RULE, 2)]

@@ -126,7 +126,7 @@ HANGS = {"loop": loop, "swallow errors": swallow_errors}
 @FORKS
 @pytest.mark.parametrize("hang", HANGS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_step_that_hangs_raises_step_timeout_with_the_models_stack(view, hang):
+def test_step_timeout_raises_an_error_with_the_models_stack(view, hang):
     before = set(threading.enumerate())
     env, step = limited(view)
     env.reset(seed=4, options={"how": HANGS[hang]})
@@ -153,7 +153,7 @@ def test_step_that_hangs_raises_step_timeout_with_the_models_stack(view, hang):
     assert set(threading.enumerate()) <= before
 
 
-def test_timed_out_model_unwinds_and_runs_its_finally_blocks():
+def test_step_timeout_unwinds_the_model_through_its_finally_blocks():
     env, step = limited()
     env.reset(options={"how": loop})
     with pytest.raises(StepTimeoutError):
@@ -186,7 +186,7 @@ def test_step_timeout_does_not_change_results():
 
 
 @pytest.mark.thorough
-def test_a_model_that_never_unwinds_is_given_up(monkeypatch):
+def test_step_timeout_gives_up_a_model_that_never_unwinds(monkeypatch):
     for place in ("hooks.limits", "core.switching.threads"):
         monkeypatch.setattr(f"simenv_marl.{place}.SECONDS_TO_UNWIND", 0.3)
     monkeypatch.setattr(f"{__name__}.LIMIT", 0.1)
@@ -234,7 +234,7 @@ def test_step_timeout_ends_tasks_of_an_event_loop():
     step(1)
 
 
-def test_invalid_step_timeouts_are_refused():
+def test_envs_refuse_invalid_step_timeouts():
     for wrong in (0, -1, float("inf"), "1", True):
         with pytest.raises(OptionValueError, match="step_timeout must be a positive number"):
             limited(step_timeout=wrong)
@@ -309,7 +309,7 @@ def _alarms():
 @ALARMS
 @pytest.mark.usefixtures("_alarms")
 @pytest.mark.parametrize("interval", [0.0, 0.05])
-def test_the_alarms_of_the_user_ring_during_a_step_and_after_it(interval):
+def test_step_timeout_leaves_the_users_alarm_signals_working(interval):
     rung = []
     handler = signal.signal(signal.SIGALRM, lambda *_: rung.append(time.monotonic() - begun))
     assert handler is signal.SIG_DFL
@@ -339,7 +339,7 @@ def test_the_alarms_of_the_user_ring_during_a_step_and_after_it(interval):
 
 @ALARMS
 @pytest.mark.usefixtures("_alarms")
-def test_an_error_of_the_users_handler_surfaces_and_the_handler_stays():
+def test_step_timeout_raises_errors_of_the_users_signal_handler():
     def handler(*_):
         raise BlockingIOError("the user's own limit")
 
@@ -356,7 +356,7 @@ def test_an_error_of_the_users_handler_surfaces_and_the_handler_stays():
 
 @ALARMS
 @pytest.mark.usefixtures("_alarms")
-def test_a_model_may_have_an_alarm_of_its_own():
+def test_step_timeout_allows_a_model_its_own_alarm_signal():
     rung = []
 
     def with_alarm(seconds):
@@ -400,7 +400,7 @@ def test_step_timeout_interrupts_a_slow_mapping():
 
 @ALARMS
 @pytest.mark.parametrize(("inner", "outer"), [(0.1, 5), (5, 0.1), (None, 0.1)])
-def test_shorter_step_timeout_of_nested_environments_applies(inner, outer):
+def test_shorter_step_timeout_of_nested_envs_applies(inner, outer):
     before = stacks()
     within, step = limited(step_timeout=inner)
     seen = []

@@ -63,7 +63,7 @@ IN_ORDER = "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 3 health
 # -- names ----------------------------------------------------------------------------------------
 
 
-def test_an_agent_for_each_entity_joins_when_it_first_decides():
+def test_aec_env_adds_an_agent_when_its_entity_first_decides():
     def name(being):
         """Its number is its name; the first being is no agent."""
         named.append(being.number)
@@ -85,7 +85,7 @@ def test_an_agent_for_each_entity_joins_when_it_first_decides():
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_spaces_of_all_possible_agents_are_dicts(make):
+def test_envs_with_possible_agents_have_dicts_of_spaces(make):
     """Some learners ask for all at once, as the attributes of PettingZoo's base classes have it."""
     env = make(life("0 acts"), beings(), possible_agents=NAMES)
     assert list(env.observation_spaces) == list(env.action_spaces) == env.possible_agents
@@ -99,7 +99,7 @@ def test_spaces_of_all_possible_agents_are_dicts(make):
 
 
 @pytest.mark.filterwarnings("ignore:several objects decide")
-def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
+def test_entities_with_one_agent_name_are_one_agent():
     """The name is the agent: a model may replace the object behind it."""
     named = beings(agent=lambda being: "")
     turns = play(
@@ -114,7 +114,7 @@ def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
     ]
 
 
-def test_spaces_of_agents_that_join_late_are_separate_and_seeded():
+def test_agents_that_join_late_get_separate_seeded_spaces():
     def drawn(env, seed):
         env.reset(seed=seed)
         env.step(1)
@@ -138,7 +138,7 @@ def test_spaces_of_agents_that_join_late_are_separate_and_seeded():
 # -- rosters --------------------------------------------------------------------------------------
 
 
-def test_declared_agents_are_there_at_once_and_deciders_leave_first():
+def test_possible_agents_are_all_in_agents_after_the_reset():
     roster = [*NAMES, "being_3"]
     env = aec_env(life("2 acts, 0 acts"), beings(), possible_agents=iter(roster))
     assert env.possible_agents == roster
@@ -156,7 +156,7 @@ def test_declared_agents_are_there_at_once_and_deciders_leave_first():
     assert env.possible_agents == roster
 
 
-def test_a_roster_is_declared_by_point_where_there_are_several():
+def test_possible_agents_are_given_per_decision_point_if_there_are_several():
     clerk = decision()
 
     def main(simulation):
@@ -193,12 +193,12 @@ def test_a_roster_is_declared_by_point_where_there_are_several():
         ),
     ],
 )
-def test_invalid_rosters_are_refused(options, error, match):
+def test_envs_refuse_invalid_possible_agents(options, error, match):
     with pytest.raises(error, match=match):
         aec_env(life("0 acts"), **{"points": beings()} | options)
 
 
-def test_an_undeclared_agent_is_an_error_that_ends_the_episode():
+def test_agent_outside_possible_agents_raises_an_error():
     env = begun(aec_env(life("0 acts, 5 acts, 0 acts"), beings(), possible_agents=NAMES))
     with pytest.raises(AgentError, match=r"being_5.*possible_agents"):
         env.step(1)
@@ -209,7 +209,7 @@ def test_an_undeclared_agent_is_an_error_that_ends_the_episode():
         aec_env(life(IN_ORDER, announced=[0, 3]), beings(), possible_agents=NAMES).reset()
 
 
-def test_an_undeclared_agent_may_follow_its_rule():
+def test_agent_outside_possible_agents_can_follow_the_models_rule():
     options = {"possible_agents": NAMES, "undeclared": "rule"}
     env = aec_env(life("5 acts, 0 acts, 5 acts, 1 acts"), beings(), **options)
     assert sorted(story(play(env, 7)).split()) == ["0", "0+", "1", "1+", "2+"]
@@ -221,7 +221,7 @@ def test_an_undeclared_agent_may_follow_its_rule():
 # -- who is expected ------------------------------------------------------------------------------
 
 
-def test_expected_agents_join_and_observe_before_their_first_decision():
+def test_expected_calls_let_agents_join_and_observe_before_they_decide():
     paid = []
     definition = beings(reward_mapping=lambda being: paid.append(being.number) or 0.0)
     env = begun(aec_env(life(IN_ORDER, announced=[0, 1, 2, 2, 0]), definition))
@@ -255,9 +255,9 @@ def test_expected_agents_join_and_observe_before_their_first_decision():
             [1, 1, 1, "rule"],
         ),
     ],
-    ids=["nobody's agent", "a policy's agent", "an undeclared agent"],
+    ids=["no agent", "a policy's agent", "an undeclared agent"],
 )
-def test_expected_agents_join_only_if_the_user_decides_for_them(
+def test_expected_calls_add_no_agent_that_a_policy_decides_for(
     announced, changes, options, agents, log
 ):
     env = begun(aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options))
@@ -266,7 +266,7 @@ def test_expected_agents_join_only_if_the_user_decides_for_them(
     assert env.simulation.log == log
 
 
-def test_expected_agents_that_never_decide_end_with_the_episode():
+def test_agents_of_expected_calls_that_never_decide_end_with_the_episode():
     program = life("0 acts, 2 health 8, 2 leaves, 1 acts, 3 health 4", announced=[1, 2, 3])
     turns = play(aec_env(program, beings()), 1)
     assert story(turns) == "0 2+ 1 0+ 1+ 3+"
@@ -275,7 +275,7 @@ def test_expected_agents_that_never_decide_end_with_the_episode():
     assert turns[-1].observation.tolist() == [3, 4]  # observed anew on the call that was to come
 
 
-def test_first_expected_call_of_an_agent_is_the_one_observed():
+def test_agent_observes_the_first_of_its_expected_calls():
     named = beings(agent=lambda being: "late" if being.number else "early")
     env = begun(aec_env(life("0 acts, 4 acts", announced=[4, 3, 0]), named))
     assert env.observe("late").tolist() == [4, 0]
@@ -284,7 +284,7 @@ def test_first_expected_call_of_an_agent_is_the_one_observed():
 # -- deaths ---------------------------------------------------------------------------------------
 
 
-def test_a_removed_agent_is_rewarded_and_observed_while_it_is_whole():
+def test_removed_agent_is_rewarded_and_observed_before_its_removal():
     env = begun(aec_env(life("0 acts, 1 acts, 0 health 5, 0 leaves, 1 acts"), beings()))
     env.step(1)
     env.step(1)
@@ -314,7 +314,7 @@ class Mortal(Being):
 
 
 @pytest.mark.parametrize(("action", "answered"), [(3, "applied"), (RULE, "rule")])
-def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action, answered):
+def test_agent_removed_during_its_decision_still_gets_its_action_applied(action, answered):
     def apply(action, being):
         being.act()
         return "applied"
@@ -382,7 +382,9 @@ RENAMED = f"{GOING}, 2 number 7, 2 acts, 2 whole 0, 2 leaves, 0 acts"
         ),
     ],
 )
-def test_agents_are_removed_when_their_entities_leave(program, changes, options, expected):
+def test_env_removes_agents_when_a_removed_by_function_is_called(
+    program, changes, options, expected
+):
     env = aec_env(life(program), beings(**changes), **options)
     assert story(play(env, 1)) == expected
 
@@ -392,9 +394,7 @@ def test_agents_are_removed_when_their_entities_leave(program, changes, options,
     ("agent", "roster"), [(being_of, None), (being_of, NAMES), ("being_0", None)]
 )
 @pytest.mark.parametrize("again", [0, 1], ids=["revived", "a namesake"])
-def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(
-    view, agent, roster, again
-):
+def test_agent_that_decides_after_its_end_raises_an_error(view, agent, roster, again):
     program = life(f"0 acts, 0 leaves, {again} number 0, {again} whole 1, {again} acts, 0 fails")
     env = begun(view(program, beings(agent=agent), possible_agents=roster), 11)
     with fails(AgentError, "seed 11", match=r"being_0.*after its end"):
@@ -407,7 +407,7 @@ def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, single_env])
-def test_several_entities_under_one_name_are_warned_of_once(view):
+def test_env_warns_once_if_entities_without_agent_names_are_one_agent(view):
     """Without ``agent=``, the entities count as one agent, whose rewards and differences mix."""
 
     def main(simulation):
@@ -434,7 +434,7 @@ class Young(Being):
         return "rule"
 
 
-def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
+def test_removed_by_an_inherited_method_ends_only_agents_of_the_subclass():
     points = {
         Young.go: define(agent=lambda it: f"goer_{it.number}", removed_by=LEAVE),
         Young.come: define(agent=lambda it: f"comer_{it.number}", removed_by=LEAVE),
@@ -461,14 +461,14 @@ def test_an_inherited_removal_ends_agents_of_a_subclass_alone():
         ("tests.worlds.entities.Being.act", DefinitionError, "Being.act"),
     ],
 )
-def test_invalid_removals_are_refused(removed_by, error, match):
+def test_envs_refuse_invalid_removed_by(removed_by, error, match):
     with pytest.raises(error, match=match):
         aec_env(life("0 acts"), beings(removed_by=removed_by))
     assert Being(0).act() == "rule"
 
 
 @pytest.mark.usefixtures("_collected")  # an environment of another test would still patch the class
-def test_removing_functions_work_as_before_outside_of_environments():
+def test_removed_by_functions_work_unchanged_outside_an_env():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
     env = begun(aec_env(life("0 acts, 1 acts"), beings()))
     outside = Being(0)
@@ -479,7 +479,7 @@ def test_removing_functions_work_as_before_outside_of_environments():
     assert (vars(Being)["leave"], vars(Being)["act"]) == (leave, act)
 
 
-def test_the_single_view_ends_with_its_agent_and_the_simulation_runs_on():
+def test_single_env_terminates_when_its_agent_is_removed():
     program = life("0 acts, 0 health 4, 0 leaves, 1 health 7", ends=TRUNCATED)
     env = begun(single_env(program, beings(agent="hero_0")))
     observation, *told = env.step(1)[:4]
@@ -495,7 +495,7 @@ def test_the_single_view_ends_with_its_agent_and_the_simulation_runs_on():
         ("0 acts, 1 acts, 0 leaves, 0 fails", "being_1"),
     ],
 )
-def test_error_at_the_end_of_an_agent_names_the_agent(program, whose):
+def test_error_in_a_removed_agents_last_reward_names_the_agent(program, whose):
     env = begun(
         aec_env(life(program), beings(reward_mapping=lambda being: 1 / (being.health + 1))), 19
     )
@@ -522,7 +522,7 @@ class Forgetting(entities.AnnouncingLife):
 
 @pytest.mark.parametrize("announced", [None, [0, 1]])
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_choices_keep_no_entity_alive(make, announced):
+def test_env_does_not_keep_an_entity_alive_for_its_choices(make, announced):
     """What somebody may choose from is not held until it does."""
 
     def living(being, *, _simulation):
@@ -541,7 +541,7 @@ BY_NAME = beings(removed_by=())
 
 
 @pytest.mark.filterwarnings("ignore:end_agent.'being_7'. has no effect")
-def test_end_agent_gives_a_last_reward_and_observation():
+def test_end_agent_gives_the_agent_a_last_reward_and_observation():
     program = (
         "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
     )
@@ -558,7 +558,7 @@ def test_end_agent_gives_a_last_reward_and_observation():
     assert env.agents == ["being_0"]
 
 
-def test_outside_an_environment_end_agent_does_nothing():
+def test_end_agent_does_nothing_outside_an_environment():
     program = life("0 acts, 0 ends, 0 acts")
     env = begun(aec_env(program, BY_NAME))
     plain = begun(program())
@@ -574,7 +574,7 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 @given(colony_designs, seeds)
 @examples(120)
-def test_random_colony_in_the_aec_view_matches_the_plain_run(design, seed):
+def test_aec_env_runs_random_models_with_births_like_without_an_env(design, seed):
     plain = AnsweredColony(design, seed)
     if not plain.decisions:
         return

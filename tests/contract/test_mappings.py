@@ -106,7 +106,7 @@ def last_choice(agent, env):
     ("title", "pay", "earned"),
     [("here", pay, [0, 2, 4, 6]), ("there", difference(pay), [0, 2, 2, 2])],
 )
-def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned):
+def test_observation_and_reward_mappings_can_take_the_simulation(title, pay, earned):
     other = begun(aec_env(Market("elsewhere"), points()))
     env = aec_env(Market(title), points(reward_mapping=pay))
     turns = play(env, last_choice, seed=5)
@@ -124,7 +124,7 @@ def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay,
     assert other.simulation.log == [("elsewhere", "low")]
 
 
-def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation():
+def test_action_mask_goal_and_rule_mappings_can_take_the_simulation():
     changes = {
         "choices": None,
         "apply": None,
@@ -152,7 +152,7 @@ def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation():
     assert env.simulation.log == [("market", 0), rule, rule, rule, ("market", 1), rule]
 
 
-def test_mappings_get_the_simulation_in_every_view_and_runner():
+def test_mappings_can_take_the_simulation_in_every_env_and_in_simulate():
     roster = {"possible_agents": ["market_0", "market_1"]}
     parallel = parallel_env(Market, points(), **roster)
     assert parallel.reset(seed=2)[0]["market_1"].tolist() == [0, 2]
@@ -174,7 +174,7 @@ def test_mappings_get_the_simulation_in_every_view_and_runner():
     assert made.observations[:, 1].tolist() == [0] * 6 + [1] * 6 + [2] * 6
 
 
-def test_mappings_of_a_copy_get_its_own_simulation():
+def test_mappings_of_a_copied_env_get_the_copys_simulation():
     env = begun(aec_env(Market, points()))
     env.close()
     again = pickle.loads(pickle.dumps(env))
@@ -182,7 +182,7 @@ def test_mappings_of_a_copy_get_its_own_simulation():
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 2])
-def test_mappings_keep_no_simulation_alive(episodes):
+def test_mappings_do_not_keep_a_dropped_envs_simulation_alive(episodes):
     env = aec_env(Market, points())
     for _ in range(episodes):
         env.reset(seed=1)

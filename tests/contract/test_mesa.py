@@ -40,7 +40,7 @@ def herd():
 
 
 @pytest.mark.parametrize("seed", [5, 11])
-def test_mesa_wolf_sheep_stepped_with_rule_matches_the_plain_run(seed):
+def test_mesa_wolf_sheep_env_with_rule_actions_runs_like_without_env(seed):
     plain = Pasture()
     plain.reset(seed)
     plain.run()

@@ -135,9 +135,9 @@ def episode(env):
 @pytest.mark.parametrize(
     ("policies", "moves"),
     [(None, [1, 3, 1, 2, 1, 1]), ({"player_blue": lambda observation: 0}, [1] * 6)],
-    ids=["their rule", "policies"],
+    ids=["the model's rule", "policies"],
 )
-def test_agent_option_asks_one_agent_and_leaves_others_to_policies(policies, moves):
+def test_single_env_agent_option_leaves_other_agents_to_policies(policies, moves):
     env = single_env(Game, MOVE, agent="player_red", policies=policies)
     steps, offers = episode(env)
     assert offers == [1, 3, 1, 2, 1, 1]
@@ -148,7 +148,7 @@ def test_agent_option_asks_one_agent_and_leaves_others_to_policies(policies, mov
         env.step(0)
 
 
-def test_agent_with_a_fixed_name_can_be_chosen_among_several_points():
+def test_single_env_agent_can_be_chosen_among_several_decision_points():
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
     env = begun(
         single_env(
@@ -165,7 +165,7 @@ def test_agent_with_a_fixed_name_can_be_chosen_among_several_points():
     assert env.simulation.log == [(5, 1), (5, 1)]
 
 
-def test_possible_agents_by_point_assign_agents_to_points():
+def test_possible_agents_by_decision_point_tell_where_each_agent_decides():
     named = {
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
@@ -178,7 +178,7 @@ def test_possible_agents_by_point_assign_agents_to_points():
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_episode_without_the_agent_raises_error_listing_other_agents():
+def test_single_env_reset_without_its_agent_names_the_other_agents():
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
@@ -233,14 +233,14 @@ def simulated(simulation, points, **options):
         ),
     ],
 )
-def test_invalid_uses_of_the_agent_option_are_refused(
+def test_single_env_refuses_invalid_uses_of_the_agent_option(
     make, simulation, points, options, error, match
 ):
     with pytest.raises(error, match=match):
         make(simulation, points, **options)
 
 
-def test_agent_option_works_wherever_single_views_are_made():
+def test_agent_option_works_in_generate_env_registration_and_vector_env():
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
@@ -256,7 +256,7 @@ def test_agent_option_works_wherever_single_views_are_made():
 # -- skip_forced= ---------------------------------------------------------------------------------
 
 
-def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up():
+def test_skip_forced_adds_up_rewards_and_times_of_skipped_decisions():
     steps, _ = episode(single_env(Game, MOVE, agent="player_red"))
     env = single_env(Game, MOVE, agent="player_red", skip_forced=True)
     skipped, offers = episode(env)
@@ -268,7 +268,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up():
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_skip_forced_asks_neither_the_user_nor_a_policy():
+def test_skip_forced_asks_nobody_if_only_one_action_is_legal():
     asked = []
 
     def policy(observation, info):
@@ -291,7 +291,7 @@ def test_skip_forced_asks_neither_the_user_nor_a_policy():
     assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
-def test_forced_moves_in_rounds_consume_no_action():
+def test_parallel_env_with_skip_forced_keeps_actions_of_skipped_decisions():
     env, joint = parallel_env(Game, MOVE, **ROSTER), joint_env(Game, MOVE, **ROSTER)
     env.reset(seed=0)
     joint.reset(seed=0)
@@ -330,7 +330,7 @@ def test_skip_forced_works_with_masks_instead_of_choices(changes, asked, moves):
     assert moves_of(env, "player_red") == moves
 
 
-def test_episode_with_only_forced_moves_ends_at_the_first_step():
+def test_skip_forced_episode_without_a_choice_ends_at_the_first_step():
     env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
     for _ in range(2):
         observation, _ = env.reset(seed=0)
@@ -394,7 +394,7 @@ def flown(make, space, action, *, clip_actions=True):
         ),
     ],
 )
-def test_actions_outside_a_box_are_clipped_with_the_option_alone(view, space, action, expected):
+def test_actions_outside_a_box_are_clipped_only_with_clip_actions(view, space, action, expected):
     taken = flown(view, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
     with pytest.raises(InvalidActionError):
@@ -418,12 +418,12 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(view, space, ac
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_actions_that_cannot_be_clipped_are_refused(space, wrong):
+def test_clip_actions_refuses_actions_that_cannot_be_clipped(space, wrong):
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 
 
-def test_the_vector_view_clips_as_the_single_view_does():
+def test_vector_env_clips_actions_like_single_env():
     two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
     assert same(
@@ -436,7 +436,7 @@ def test_the_vector_view_clips_as_the_single_view_does():
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-def test_rewards_of_agents_ended_during_reset_come_with_the_first_step():
+def test_single_env_first_step_returns_rewards_earned_during_reset():
     """The first being has no choice and is out before the second one is asked."""
     program = (
         "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2,"
@@ -462,7 +462,7 @@ def test_rewards_of_agents_ended_during_reset_come_with_the_first_step():
 
 
 @pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
-def test_single_view_ends_with_its_agent_even_if_others_go_on(policies):
+def test_single_env_terminates_with_its_agent_even_if_others_go_on(policies):
     program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
     env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):

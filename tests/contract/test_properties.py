@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given
 
-from simenv_marl import RULE, aec_env
+from simenv_marl import aec_env
 from simenv_marl.errors import EpisodeOverError
 from tests.extent import examples
 from tests.worlds.models import play
@@ -15,18 +15,16 @@ from tests.worlds.random_worlds import (
     points_of,
     seeds,
     world_designs,
-    world_policy,
+    world_policies,
 )
 
 
 def made(design):
     """An environment of a design."""
     points = points_of(design)
-    policies = {points[point]: world_policy for point in design.policies} | {
-        points[point]: RULE for point in design.rules
-    }
+    policies = world_policies(design, points)
     return aec_env(
-        lambda: World(design, points), points, policies=policies or None, max_steps=design.max_steps
+        lambda: World(design, points), points, policies=policies, max_steps=design.max_steps
     )
 
 
@@ -59,7 +57,7 @@ def agrees(env, reference):
 
 @given(world_designs(), seeds, answers)
 @examples(300)
-def test_random_episodes_match_a_reference_implementation(design, seed, given_answers):
+def test_aec_env_matches_a_reference_implementation_of_random_models(design, seed, given_answers):
     """Also the rewards that each step books: none is lost or counted twice."""
     env = made(design)
     booked = {}

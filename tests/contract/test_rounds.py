@@ -47,7 +47,7 @@ def acted(results):
 # -- the rule of rounds ---------------------------------------------------------------------------
 
 
-def test_observations_do_not_show_the_moves_of_the_same_round():
+def test_parallel_env_observations_do_not_show_moves_of_the_same_step():
     env = parallel_env(life("0 acts, 1 health 5, 1 acts, 0 health 6", announced=[0, 1]), beings())
     observations, _ = env.reset()
     assert {agent: seen.tolist() for agent, seen in observations.items()} == {
@@ -64,7 +64,7 @@ def test_observations_do_not_show_the_moves_of_the_same_round():
     assert env.agents == []
 
 
-def test_parallel_step_answers_nested_decisions():
+def test_parallel_env_step_answers_nested_decisions():
     inner = decision(agent="inner_0")
     outer = decision(lambda: inner() + 1, agent="outer_0")
     env = parallel_env(calling(outer), [outer, inner])
@@ -74,7 +74,7 @@ def test_parallel_step_answers_nested_decisions():
     assert acted(results) == {"outer_0", "inner_0"}
 
 
-def test_actions_of_a_round_are_replayed_as_they_were_given():
+def test_branch_replays_actions_that_a_mapping_has_changed_in_place():
     box = {
         "action_space": spaces.Box(0, 9, (1,)),
         "action_space_mapping": lambda action: action.__iadd__(1).item(),
@@ -96,7 +96,7 @@ def play_rounds(env, share, rounds=10):
 
 
 @pytest.mark.filterwarnings("error")
-def test_episode_end_warns_once_of_the_number_of_lost_actions():
+def test_parallel_env_warns_once_of_the_number_of_unused_actions():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def main(simulation):
@@ -138,7 +138,7 @@ def test_episode_end_warns_once_of_the_number_of_lost_actions():
     ],
     ids=repr,
 )
-def test_refused_round_leaves_the_environment_unchanged(actions, error, match):
+def test_parallel_env_is_unchanged_after_it_refuses_a_step(actions, error, match):
     calls = []
     ant, bee = (
         decision(agent=name, reward_mapping=lambda: calls.append(0) or 1.0)
@@ -157,7 +157,7 @@ def test_refused_round_leaves_the_environment_unchanged(actions, error, match):
 
 
 @pytest.mark.parametrize("padded", [False, True])
-def test_empty_step_after_the_end_returns_empty_dicts(padded):
+def test_parallel_env_returns_empty_dicts_for_an_empty_step_after_the_end(padded):
     """PettingZoo's own environments do so, and wrappers rely on it."""
     ant = decision(agent="ant_0")
     env = parallel_env(calling(ant), ant)
@@ -179,7 +179,7 @@ def test_empty_step_after_the_end_returns_empty_dicts(padded):
     assert env.agents == []
 
 
-def test_choices_may_be_empty_at_the_end():
+def test_parallel_env_accepts_empty_choices_at_the_end_of_an_episode():
     left = ["axe", "bow"]
     ant = decision(agent="ant_0", choices=lambda: left, action_space=spaces.Discrete(2))
 
@@ -206,7 +206,7 @@ def test_choices_may_be_empty_at_the_end():
     ids=["choices", "mask"],
 )
 @pytest.mark.parametrize("make", [parallel_env, joint_env])
-def test_there_may_be_no_legal_action_between_decisions(make, legal):
+def test_action_mask_is_open_if_no_action_is_legal_between_decisions(make, legal):
     def main(simulation):
         for _ in range(3):
             HAND.extend("xy")
@@ -232,7 +232,7 @@ HAND = []
 # -- births and deaths ----------------------------------------------------------------------------
 
 
-def test_the_dead_are_dropped_from_agents_in_the_same_step():
+def test_parallel_env_drops_ended_agents_from_agents_in_the_same_step():
     program = "0 acts, 1 health 3, 1 leaves, 0 health 6, 0 leaves, 2 acts, 2 acts, 2 forgotten"
     env = parallel_env(life(program, announced=[0, 1, 2]), beings())
     env.reset()
@@ -265,7 +265,7 @@ def test_the_dead_are_dropped_from_agents_in_the_same_step():
         ("action_mask_mapping", [1] * 10),
     ],
 )
-def test_errors_in_mappings_say_whose_they_were(mapping, good):
+def test_parallel_env_errors_in_mappings_name_the_agent_and_the_seed(mapping, good):
     def bad():
         if len(env.simulation.log) == 2:
             raise ZeroDivisionError
@@ -366,7 +366,9 @@ class Rounds:
 )
 @examples(150)
 @pytest.mark.filterwarnings("ignore:.*agents that did not appear")
-def test_random_rounds_match_a_reference_implementation(program, seed, max_steps, data):
+def test_parallel_env_matches_a_reference_implementation_of_random_models(
+    program, seed, max_steps, data
+):
     env = parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
     env.simulation.program = program
     reference = Rounds(program, seed, max_steps)
@@ -450,7 +452,7 @@ def played(env, seed, in_turns):
 
 @given(colony_designs, seeds)
 @examples(60)
-def test_random_colony_in_the_parallel_view_matches_the_plain_run(design, seed):
+def test_parallel_env_runs_random_models_with_births_like_without_an_env(design, seed):
     plain = AnsweredColony(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
     for simulation, roster, in_turns in (

@@ -70,7 +70,7 @@ EXPECTED = [
 ]
 
 
-def test_an_entity_with_two_kinds_of_decisions_is_one_agent():
+def test_entity_with_two_kinds_of_decisions_is_one_agent():
     env = aec_env(Ward, points())
     turns = play(env, lambda agent, env: int(env.last()[0][0]))
     assert env.simulation.log == EXPECTED
@@ -87,7 +87,7 @@ class Announcing(Ward):
         return [(nurse,) for nurse in self.nurses]
 
 
-def test_agent_expected_at_one_point_may_decide_at_another():
+def test_agent_of_expected_calls_can_decide_at_another_decision_point():
     shifted = points(action_space_mapping=lambda action: action + 1)
     env = aec_env(Announcing, shifted)
     play(env, 0)
@@ -99,7 +99,7 @@ def test_agent_expected_at_one_point_may_decide_at_another():
     assert env.simulation.log == EXPECTED
 
 
-def test_agents_with_one_name_share_a_string():
+def test_decision_points_of_one_agent_name_share_an_agent():
     ant, other = decision(agent="ant_0"), decision(agent="ant_0")
     for make in (aec_env, parallel_env):
         env = make(calling(ant, other, ant), [ant, other])
@@ -115,7 +115,7 @@ def test_agents_with_one_name_share_a_string():
     assert simulation.log == [4, 4]
 
 
-def test_different_spaces_need_the_turn_view():
+def test_agent_with_two_kinds_of_spaces_needs_turn_env():
     ant, other = decision(agent="ant_0"), decision(agent="ant_0", **NUMBERS)
     with pytest.raises(AgentError, match="have the same agent 'ant_0', but their spaces differ"):
         aec_env(calling(ant, other), [ant, other])
@@ -143,7 +143,7 @@ def test_different_spaces_need_the_turn_view():
     assert total == 10.0
 
 
-def test_state_has_one_part_per_agent_with_two_kinds_of_observations():
+def test_env_state_has_one_part_per_agent_with_two_kinds_of_observations():
     make = points(observation_space=spaces.Discrete(3), observation_space_mapping=lambda nurse: 2)
     names = {point: ["ann", "bob"] for point in make}
     given = {"possible_agents": names, "state_space": "observations", "state_in_info": True}
@@ -176,7 +176,7 @@ def births(most):
     return script(main), choose
 
 
-def test_a_roster_is_an_upper_bound_where_agents_are_born():
+def test_possible_agents_may_list_more_agents_than_are_born():
     make, choose = births(3)
     names = [f"ant_{number}" for number in range(5)]
     env = aec_env(make, choose, possible_agents=names)
@@ -206,7 +206,7 @@ class Colony:
 ANTS = {f"{__name__}.Colony.decide": define(agent=lambda colony, number: f"ant_{number}")}
 
 
-def test_a_single_view_waits_for_an_episode_in_which_its_agent_is_born():
+def test_single_env_resets_until_its_agent_appears():
     env = single_env(Colony, ANTS, agent="ant_1")
     seeds = []
     for seed in range(8):
@@ -223,7 +223,7 @@ def test_a_single_view_waits_for_an_episode_in_which_its_agent_is_born():
         never.reset(seed=0)
 
 
-def test_deterministic_simulation_is_not_reset_with_further_seeds(monkeypatch):
+def test_single_env_resets_a_deterministic_simulation_only_once(monkeypatch):
     monkeypatch.setattr(Colony, "deterministic", True, raising=False)
     env = single_env(Colony, ANTS, agent="ant_1")
     with pytest.raises(NoDecisionError):

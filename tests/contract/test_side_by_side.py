@@ -40,7 +40,7 @@ def run_inner(env, action):
         "policy",
     ],
 )
-def test_rules_mappings_and_policies_may_run_an_environment_of_their_own(place):
+def test_models_mappings_and_policies_can_run_an_env_of_their_own(place):
     inner, logs = inner_env(), []
     value = {"observation_space_mapping": [0, 0], "reward_mapping": 0, "agent": "outer_0"}.get(
         place, 7
@@ -66,7 +66,7 @@ def test_rules_mappings_and_policies_may_run_an_environment_of_their_own(place):
     assert all(log == [[4, 4, 4], ["inner rule"] * 3] for log in logs)
 
 
-def test_errors_pass_through_environments_that_are_nested_deeply():
+def test_env_errors_pass_through_deeply_nested_environments():
     def nested(depth):
         decide = decision(lambda: nested(depth - 1) if depth else 1 / 0, agent=f"deep_{depth}")
         run_inner(single_env(calling(decide), decide), RULE)
@@ -81,7 +81,7 @@ def test_errors_pass_through_environments_that_are_nested_deeply():
     env.step(1)
 
 
-def test_nested_environments_in_mid_episode_are_unwound_when_dropped():
+def test_dropped_env_unwinds_environments_nested_in_its_model():
     before, unwound, outer = stacks(), [], decision(agent="outer_0")
 
     def main(simulation):
@@ -98,7 +98,7 @@ def test_nested_environments_in_mid_episode_are_unwound_when_dropped():
     assert sorted(unwound) == ["outer", "unwound"]
 
 
-def test_environments_may_be_stepped_from_greenlets_of_the_user():
+def test_env_can_be_stepped_from_a_users_greenlets():
     decide = decision()
     env = begun(single_env(calling(*[decide] * 6), decide))
     for number in range(6):
@@ -110,7 +110,7 @@ def test_environments_may_be_stepped_from_greenlets_of_the_user():
 
 
 @pytest.mark.parametrize("how", ["collect", "error"])
-def test_simpy_models_unwind(how):
+def test_env_close_unwinds_all_processes_of_a_simpy_model(how):
     before, unwound, decide = stacks(), [], decision(lambda: 1 / 0)
 
     def process(env, number):
@@ -142,7 +142,7 @@ def test_simpy_models_unwind(how):
 
 
 @pytest.mark.parametrize("how", ["end", "collect"])
-def test_greenlets_of_the_model_may_decide_and_unwind(how):
+def test_greenlets_that_a_model_starts_can_decide_and_unwind(how):
     before, unwound = stacks(), []
     decide = decision(lambda name: name, agent=lambda name: f"{name}_0")
 
@@ -178,7 +178,7 @@ def test_greenlets_of_the_model_may_decide_and_unwind(how):
 # -- asyncio --------------------------------------------------------------------------------------
 
 
-def test_interleaved_asyncio_models_do_not_affect_each_other():
+def test_interleaved_envs_of_asyncio_models_do_not_affect_each_other():
     """Clerks work concurrently on one event loop; each decides how many rounds a task takes."""
 
     async def few(number):
@@ -216,7 +216,7 @@ def test_interleaved_asyncio_models_do_not_affect_each_other():
 
 
 @pytest.mark.usefixtures("_collected")
-def test_models_may_recurse_as_deeply_as_without_an_environment():
+def test_env_allows_models_the_full_recursion_depth():
     decide = decision()
 
     def dive(depth):

@@ -33,7 +33,7 @@ from tests.worlds.models import DRIVERS, calling, decision, fails, notes, script
 from tests.worlds.valued import LEFT, Duel, points
 
 
-def test_simulate_without_policies_is_the_plain_run_of_a_copy():
+def test_simulate_without_policies_runs_a_copy_of_the_model_unchanged():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     # and lists it
     assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]
@@ -94,7 +94,7 @@ def test_simulate_refuses_invalid_arguments(run, arguments, error, match):
 
 @given(colony_designs, seeds)
 @examples(40)
-def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
+def test_simulate_runs_random_models_with_births_like_without_policies(design, seed):
     plain = AnsweredColony(design, seed)
     points = colony_points(overseen=bool(design.overseen))
 
@@ -121,7 +121,9 @@ def test_random_colony_in_simulate_matches_the_plain_run(design, seed):
     ],
     ids=["both", "rule of the point", "rule of the agent"],
 )
-def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent, expected):
+def test_simulate_prefers_an_agents_policy_to_its_decision_points_policy(
+    of_point, of_agent, expected
+):
     source = script(
         lambda simulation: simulation.log.extend(Being(number).act() for number in (0, 1))
     )
@@ -139,7 +141,7 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
 
 @pytest.mark.parametrize("undeclared", ["error", "rule"])
 @pytest.mark.parametrize("declared", [["being_0"], {Being.act: ["being_0"]}])
-def test_possible_agents_may_be_declared(declared, undeclared):
+def test_simulate_accepts_possible_agents(declared, undeclared):
     def main(simulation):
         simulation.log = [Being(number).act() for number in (0, 1)]
 
@@ -149,7 +151,7 @@ def test_possible_agents_may_be_declared(declared, undeclared):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_many_simulations_may_declare_possible_agents(workers):
+def test_simulate_many_accepts_possible_agents(workers):
     def main(simulation):
         simulation.log = [Being(number).act() for number in (0, 1)]
 
@@ -165,7 +167,7 @@ def test_many_simulations_may_declare_possible_agents(workers):
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_keep_no_entity_alive(action):
+def test_simulate_keeps_no_entity_alive_after_its_decision(action):
     def main(simulation):
         for number in range(3):
             being = Being(number)
@@ -191,7 +193,7 @@ def test_policies_keep_no_entity_alive(action):
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_a_policy_gets_the_simulation_of_its_own_episode(driver):
+def test_simulate_passes_policies_the_simulation_of_their_own_episode(driver):
     asked = []
 
     def policy(observation, *, _simulation):
@@ -203,7 +205,7 @@ def test_a_policy_gets_the_simulation_of_its_own_episode(driver):
     assert all(simulation is done for simulation in asked)
 
 
-def test_note_of_an_error_counts_the_decisions_of_policies():
+def test_simulate_error_note_counts_the_decisions_of_policies():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     policies = {"ant_0": lambda observation: 1, "bee_0": lambda observation: 2}
     with pytest.raises(ZeroDivisionError) as caught:

@@ -80,7 +80,7 @@ def test_simulate_many_matches_simulate_one_by_one(design, seeds, size):
         assert simulation.random.getstate() == alone.random.getstate()
 
 
-def test_simulate_many_without_policies_gives_plain_runs():
+def test_simulate_many_without_policies_runs_models_unchanged():
     ant = decision(agent="ant_0")
     assert [s.log for s in simulate_many(calling(ant, ant), seeds=range(3))] == [
         ["rule", "rule"]
@@ -91,7 +91,7 @@ def test_simulate_many_without_policies_gives_plain_runs():
     assert simulate_many(calling(ant), {ant: ones}, seeds=[]) == []
 
 
-def test_results_have_one_simulation_per_seed_in_order_of_seeds():
+def test_simulate_many_returns_one_simulation_per_seed_in_order():
     found = simulate_many(
         Going, {Going.decide: ones}, points=going, seeds=iter([4, 0, 2, 4]), batch_size=2
     )
@@ -104,7 +104,7 @@ def test_results_have_one_simulation_per_seed_in_order_of_seeds():
     assert not hasattr(given_simulation, "log")
 
 
-def test_policies_see_stacks_of_all_kinds_of_spaces():
+def test_simulate_many_stacks_observations_of_all_spaces_for_policies():
     kinds = [
         spaces.Box(-9, 9, (2,), np.float32),
         spaces.Discrete(5),
@@ -129,7 +129,7 @@ def test_policies_see_stacks_of_all_kinds_of_spaces():
     assert [simulation.log for simulation in found] == [[1]] * 4
 
 
-def test_policies_own_their_observations_and_get_infos_if_they_take_them():
+def test_simulate_many_policies_own_observations_and_can_take_infos():
     mask = [0, 1] + [0] * 8
     ant = decision(agent="ant_0", action_mask_mapping=lambda: mask, **PAIRS)
 
@@ -147,7 +147,7 @@ def test_policies_own_their_observations_and_get_infos_if_they_take_them():
     assert [simulation.log for simulation in found] == [[1, 1]] * 3
 
 
-def test_policy_of_several_points_gets_their_rows_in_one_batch():
+def test_simulate_many_batches_all_decision_points_of_a_policy_together():
     ant, bee = decision(agent="ant_0", **PAIRS), decision(agent="bee_0", **PAIRS)
     cat = decision(agent="cat_0")  # who observes something else
     asked = []
@@ -167,7 +167,7 @@ def test_policy_of_several_points_gets_their_rows_in_one_batch():
     assert asked == [10, 3, 3]
 
 
-def test_ended_simulations_are_replaced_up_to_the_batch_size():
+def test_simulate_many_starts_new_simulations_up_to_the_batch_size():
     asked, under_way, ended = [], weakref.WeakSet(), []
 
     class Watched(Going):
@@ -235,7 +235,7 @@ BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_batched_policies_may_return_any_kind_of_rows(space, answer, expected):
+def test_simulate_many_accepts_lists_arrays_and_generators_from_policies(space, answer, expected):
     ant = decision(agent="ant_0", action_space=space)
     found = simulate_many(
         calling(ant), {ant: lambda observations: answer}, seeds=range(len(expected))
@@ -248,7 +248,7 @@ def test_batched_policies_may_return_any_kind_of_rows(space, answer, expected):
     [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))],
     ids=repr,
 )
-def test_a_wrong_number_of_actions_is_refused(answer):
+def test_simulate_many_refuses_a_wrong_number_of_actions(answer):
     ant = decision(agent="ant_0")
     with fails(InvalidActionError, "3", match=r"2 decisions|not in its action space"):
         simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=[3, 4])
@@ -329,7 +329,9 @@ def observe(simulation):
         "collect",
     ],
 )
-def test_error_in_a_run_names_its_seed_and_unwinds_all_simulations(error, arguments, told, run):
+def test_simulate_many_error_names_the_seed_and_unwinds_all_simulations(
+    error, arguments, told, run
+):
     Delicate.ended.clear()
     plain, before = vars(Going)["decide"], stacks()
     usual = {
@@ -348,7 +350,7 @@ def test_error_in_a_run_names_its_seed_and_unwinds_all_simulations(error, argume
     assert not stacks(before)
 
 
-def test_error_in_a_factory_names_the_seed():
+def test_simulate_many_error_in_a_factory_names_the_seed():
     models = [Going()]
     with fails(IndexError, "seed 17"):
         simulate_many(lambda: models.pop(), {Going.decide: ones}, points=going, seeds=[20, 17])
@@ -376,7 +378,7 @@ def test_simulate_many_refuses_invalid_arguments(wrong):
         simulate_many(Going, **{"seeds": range(3), "points": going} | wrong)
 
 
-def test_seeds_may_be_an_array_and_workers_as_many_as_there_are():
+def test_simulate_many_takes_an_array_of_seeds_and_workers_minus_one():
     told = lambda simulation: (type(simulation.seed), simulation.log)  # noqa: E731
     given = {"seeds": np.arange(3), "points": going, "workers": -1}
     assert simulate_many(Going, {Going.decide: ones}, **given, collect=told) == [
@@ -384,7 +386,7 @@ def test_seeds_may_be_an_array_and_workers_as_many_as_there_are():
     ]
 
 
-def test_plugins_are_for_these_simulations_alone():
+def test_simulate_many_plugins_act_only_in_its_own_simulations():
     called = []
     plugins = [(lambda simulation: called.append(simulation.seed), Going.decide, "before")]
     given = {"points": going, "batch_size": 2, "plugins": plugins}
@@ -395,7 +397,7 @@ def test_plugins_are_for_these_simulations_alone():
     assert len(called) == 6
 
 
-def test_policies_and_rules_may_call_simulate_many():
+def test_simulate_many_can_be_called_by_policies_and_models():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def look_ahead(observations):
@@ -416,13 +418,13 @@ def test_policies_and_rules_may_call_simulate_many():
 @pytest.mark.parametrize(
     ("missing", "wanted"), [("tqdm.auto", {"progress": True}), ("joblib", {"workers": 2})]
 )
-def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wanted):
+def test_simulate_many_error_names_the_extra_of_a_missing_package(monkeypatch, missing, wanted):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[many\]"):
         simulate_many(Going, seeds=[1, 2], **wanted)
 
 
-def test_more_simulations_run_at_once_if_the_policy_is_the_slower_part(monkeypatch):
+def test_simulate_many_runs_more_simulations_at_once_if_policies_are_slow(monkeypatch):
     """Few simulations run at first, for the processor's caches; the results are always the same."""
     monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
     clock = [0.0]  # stands still while simulations run
@@ -449,7 +451,7 @@ def test_more_simulations_run_at_once_if_the_policy_is_the_slower_part(monkeypat
     assert crowd(1.0)[:4] == [4, 8, 16, 32]
 
 
-def test_functions_that_run_many_simulations_have_the_same_defaults():
+def test_simulate_many_collect_episodes_and_evaluate_share_their_defaults():
     expected = {"batch_size": 1024, "concurrency": 64, "workers": 0, "progress": False}
     for function in (simulate_many, collect_episodes, evaluate, run_experiment):
         parameters = inspect.signature(function).parameters

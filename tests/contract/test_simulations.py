@@ -50,7 +50,7 @@ class Simulation(SimulationInterface):
             self.parts.append(self.model.decide())
 
 
-def test_an_instance_is_copied_as_it_stands_when_the_environment_is_made():
+def test_env_copies_a_simulation_instance_when_it_is_made():
     original = Simulation()
     original.parts.append("grown")
     one, two = aec_env(original, Model.decide), aec_env(original, Model.decide)
@@ -66,7 +66,7 @@ def test_an_instance_is_copied_as_it_stands_when_the_environment_is_made():
 
 @pytest.mark.parametrize("named", [True, False], ids=["points", "points of the simulation"])
 @pytest.mark.parametrize("kind", ["class", "factory"])
-def test_simulation_is_made_once_per_environment_and_reset_per_episode(kind, named):
+def test_env_makes_its_simulation_once_and_resets_it_per_episode(kind, named):
     made = []
 
     class Counted(Simulation):
@@ -93,7 +93,7 @@ def test_simulation_is_made_once_per_environment_and_reset_per_episode(kind, nam
     assert made == [simulation, *(other.simulation for other in others)]
 
 
-def test_anything_that_runs_and_resets_is_a_simulation():
+def test_env_accepts_any_object_with_run_and_reset_as_a_simulation():
     class Duck:
         __slots__ = ("log",)
 
@@ -136,7 +136,7 @@ class Lockable(Simulation):
     [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()],
     ids=plainly,
 )
-def test_objects_that_are_no_simulation_are_refused(source):
+def test_env_refuses_objects_without_run_and_reset(source):
     with pytest.raises(SimulationError, match="simulation"):
         single_env(source, Model.decide)
 
@@ -190,7 +190,7 @@ def seeds_of(env):
     return env.simulation.got
 
 
-def test_seeds_are_drawn_until_one_is_given_and_then_derived():
+def test_env_reset_without_a_seed_draws_one_or_derives_it_from_the_last():
     one, two, three = (
         make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env)
     )
@@ -211,7 +211,7 @@ def test_seeds_are_drawn_until_one_is_given_and_then_derived():
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", [1]])
-def test_invalid_seeds_are_refused_without_a_reset(seed):
+def test_env_reset_refuses_invalid_seeds_before_it_resets_the_model(seed):
     env = begun(single_env(recording(reset_seed), Model.decide), 1)
     with pytest.raises(OptionValueError, match="seed must be a non-negative"):
         env.reset(seed=seed)
@@ -219,7 +219,7 @@ def test_invalid_seeds_are_refused_without_a_reset(seed):
     env.step(3)
 
 
-def test_action_spaces_are_seeded_before_they_are_asked_for_and_after():
+def test_env_reset_seeds_action_spaces_in_use_and_later_ones():
     points = [decision(agent="a_0"), decision(agent="b_0")]
     one, two = (aec_env(calling(*points), points) for _ in range(2))
     before = {agent: two.action_space(agent) for agent in ("a_0", "b_0")}
@@ -244,7 +244,7 @@ def samples(space):
     ("ends", "truncated"),
     [(None, False), (TRUNCATED, True), (True, False), (0, False), ("truncated", False)],
 )
-def test_the_return_of_run_ends_the_episode(ends, truncated):
+def test_episode_ends_when_the_models_run_returns(ends, truncated):
     decide = decision()
     env = begun(single_env(calling(decide, ends=ends), decide))
     flags = env.step(1)[2:4]
@@ -252,7 +252,7 @@ def test_the_return_of_run_ends_the_episode(ends, truncated):
     assert [type(flag) for flag in flags] == [bool, bool]
 
 
-def test_stop_is_called_to_unwind_and_only_then():
+def test_env_calls_the_models_stop_only_to_abort_an_episode():
     class Stoppable(Script):
         stops = 0
 
@@ -268,7 +268,7 @@ def test_stop_is_called_to_unwind_and_only_then():
 
 
 @pytest.mark.parametrize("make", [aec_env, single_env])
-def test_an_episode_without_a_decision_is_an_error(make):
+def test_env_reset_raises_an_error_if_an_episode_has_no_decision(make):
     decide, calls = decision(), []
     env = make(script(lambda simulation: [call() for call in calls]), decide)
     with pytest.raises(NoDecisionError, match="without a decision"):
@@ -286,7 +286,7 @@ def test_an_episode_without_a_decision_is_an_error(make):
 # -- decisions where nobody can be asked ----------------------------------------------------------
 
 
-def test_decisions_outside_of_run_run_their_rule():
+def test_decisions_in_reset_stop_or_render_follow_the_models_rule():
     class Curious(Script):
         def __init__(self):
             super().__init__(lambda simulation: simulation.log.append(Model().decide()))
@@ -314,7 +314,7 @@ def test_decisions_outside_of_run_run_their_rule():
     assert simulation.seen == [0] * 5
 
 
-def test_decisions_in_mappings_and_policies_run_their_rule():
+def test_decisions_in_mappings_and_policies_follow_the_models_rule():
     seen = []
 
     def ask(*args, answer=None):
@@ -351,7 +351,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("own", OTHERS.values(), ids=OTHERS)
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_attributes_named_like_optional_methods_are_ignored(make, own):
+def test_env_ignores_attributes_named_like_a_models_optional_methods(make, own):
     env = make(type("Own", (Simulation,), own), Model.decide)
     with pytest.raises(NotImplementedError, match=r"has no method state\(\)"):
         env.unwrapped.state()
@@ -367,7 +367,7 @@ def test_attributes_named_like_optional_methods_are_ignored(make, own):
         make(type("Own", (Simulation,), own), Model.decide, discount_rate=1.0).reset()
 
 
-def test_attributes_may_be_set_by_the_reset():
+def test_env_ignores_attributes_that_reset_names_like_optional_methods():
     class Own(Simulation):
         def reset(self):
             super().reset()
@@ -381,7 +381,7 @@ def test_attributes_may_be_set_by_the_reset():
     env.close()
 
 
-def test_optional_methods_may_have_further_parameters_with_defaults():
+def test_env_accepts_optional_model_methods_with_default_parameters():
     log = []
 
     class Own(Simulation):
@@ -405,7 +405,7 @@ def test_optional_methods_may_have_further_parameters_with_defaults():
 
 
 @pytest.mark.parametrize("method", [lambda self: [], lambda self, point, number: []])
-def test_expected_calls_without_its_parameter_are_refused(method):
+def test_env_refuses_expected_calls_without_its_parameter(method):
     kind = type("Own", (Simulation,), {"expected_calls": method})
     with pytest.raises(SimulationError, match=r"def expected_calls\(self, point\)"):
         aec_env(kind, Model.decide)
@@ -432,7 +432,7 @@ async def _do_both(self):
         (_do_both, "an async generator function", "async for _ in self.{}_model(): pass"),
     ],
 )
-def test_generator_or_coroutine_as_run_or_reset_is_refused(function, kind, line, name):
+def test_env_refuses_a_generator_or_coroutine_as_run_or_reset(function, kind, line, name):
     model = type("Own", (Simulation,), {name: function})
     for source in (model, model(), lambda: model()):
         with pytest.raises(SimulationError, match=rf"{name}\(\) of Own is {kind}") as raised:

@@ -73,7 +73,7 @@ PLAIN.reset(5)
 PLAIN.run()
 
 
-def test_items_decide_in_order_or_get_their_part_of_the_rules_result():
+def test_split_items_decide_in_order_or_get_a_part_of_the_rules_result():
     env = aec_env(Day, points())
     day = follow_the_rule(env, seed=5)
     assert (day.log, day.grid.rules) == (PLAIN.log, 4)  # the rule runs once for a call
@@ -90,7 +90,7 @@ def rule_actions(env, answers, seed=None):
     return [(turn.agent, turn.info.get("rule_action")) for turn in turns]
 
 
-def test_only_items_that_the_rule_has_answered_have_its_action():
+def test_info_has_rule_actions_only_of_split_items_that_the_rule_answered():
     env = aec_env(Day, points(rule_action_mapping=int))
     seen = rule_actions(env, {"s_0": RULE, "s_1": 7, "s_2": RULE}, seed=5)
     numbers = [(first, None, last) for first, _, last in PLAIN.log]
@@ -154,7 +154,7 @@ def beds(function):
 
 
 @pytest.mark.parametrize("by_policy", ["", "b", "bx", "ay"])
-def test_nested_and_overlapping_split_calls_keep_own_rule_actions(by_policy):
+def test_nested_and_overlapping_split_calls_keep_their_own_rule_actions(by_policy):
     answers = {name: 9 if name in by_policy else RULE for name in "abcxy"}
 
     def told(env):
@@ -206,7 +206,7 @@ SEQUENCE = {
 }
 
 
-def test_items_see_the_answers_to_the_items_before():
+def test_split_items_observe_the_answers_to_earlier_items():
     env = begun(aec_env(Hospital, {Hospital.give: define(**SEQUENCE, action_mask_mapping=free)}))
     seen = []
     for agent in env.agent_iter(6):
@@ -219,7 +219,7 @@ def test_items_see_the_answers_to_the_items_before():
     assert env.simulation.given == [[2, 1, 0]] * 2
 
 
-def test_answers_are_choices_actions_of_apply_or_the_rule():
+def test_split_item_mappings_get_earlier_answers_as_values_not_actions():
     got = []
 
     def note(name, *, _answers):
@@ -241,7 +241,7 @@ def test_answers_are_choices_actions_of_apply_or_the_rule():
         assert got[3:5] == [("b", first), ("c", first, RULE)]
 
 
-def test_items_are_observed_before_their_call_without_answers():
+def test_parallel_env_observes_split_items_at_the_reset():
     env = parallel_env(Hospital, {Hospital.give: define(**SEQUENCE)})
     observations, _ = env.reset()
     assert [seen.tolist() for seen in observations.values()] == [[0, 0]] * 3
@@ -249,13 +249,13 @@ def test_items_are_observed_before_their_call_without_answers():
     assert env.simulation.given == [[2, 1, 0]]
 
 
-def test_answers_parameter_is_refused_without_split():
+def test_make_step_refuses_an_answers_parameter_without_split():
     mapping = {"observation_space_mapping": lambda hospital, *, _answers: [0, 0]}
     with pytest.raises(DefinitionError, match="_answers"):
         aec_env(Hospital, {Hospital.give: define(**mapping)})
 
 
-def test_all_views_and_policies_answer_items():
+def test_split_items_can_be_answered_in_every_env_and_by_policies():
     env = begun(parallel_env(Day, points()), 5)
     rewards = env.step({"s_0": 3, "s_1": 4, "s_2": 5})[1]
     assert (env.simulation.log, rewards) == ([(3, 4, 5)], {"s_0": 3.0, "s_1": 4.0, "s_2": 5.0})
@@ -273,7 +273,7 @@ def test_all_views_and_policies_answer_items():
     assert [day.log for day in days] == [[(6, 6, 6)] * 4] * 2
 
 
-def test_branches_and_ends_within_a_split_call_are_exact():
+def test_branches_and_resets_within_a_split_call_keep_the_model_exact():
     env = begun(aec_env(Day, points()), 5)
     env.step(7)
     assert (
@@ -286,7 +286,7 @@ def test_branches_and_ends_within_a_split_call_are_exact():
     assert follow_the_rule(env, seed=5).log == PLAIN.log
 
 
-def test_apply_runs_for_each_item_and_gather_needs_split():
+def test_apply_runs_for_each_split_item_and_gather_needs_split():
     env = aec_env(Day, points(apply=lambda action, station, *call: -action))
     play(env, 2)
     assert env.simulation.log == [(-2, -2, -2)] * 4
@@ -316,7 +316,7 @@ class Shop:
         self.log.append((yield from self.choose()))
 
 
-def test_generators_and_coroutines_may_be_split():
+def test_split_works_for_generator_and_coroutine_functions():
     chosen, decided = (
         define(agent=lambda item, shop, name=name: f"{name}_{item}", split=lambda shop: [0, 1])
         for name in ("chosen", "decided")
@@ -348,7 +348,7 @@ def under_another_factor(action, clinic, days, *, _rule):
         clinic.factor = 2
 
 
-def test_apply_can_run_the_rule_without_asking_the_user_again():
+def test_apply_can_call_the_models_rule_without_another_decision():
     env = begun(
         single_env(
             Clinic,

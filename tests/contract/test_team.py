@@ -45,7 +45,7 @@ def agents(number=2):
 # -- who gets what --------------------------------------------------------------------------------
 
 
-def test_an_agent_gets_the_teams_reward_since_its_decision():
+def test_team_reward_of_an_agent_counts_since_its_last_decision():
     ant, bee = agents()
     team = Counter(100, 1, 2, 4, 8)
     env = aec_env(calling(ant, bee, bee, ant), [ant, bee], team_reward=team)
@@ -62,7 +62,7 @@ def test_an_agent_gets_the_teams_reward_since_its_decision():
     assert team.asked == 5  # not at the None steps
 
 
-def test_turn_and_single_views_pay_the_team_reward_once():
+def test_turn_env_and_single_env_pay_the_team_reward_once():
     for make in (turn_env, single_env):
         ant, bee = agents()
         policies = {"bee_0": lambda observation: 1} if make is single_env else None
@@ -77,7 +77,7 @@ def test_turn_and_single_views_pay_the_team_reward_once():
         assert rewards == ([1.0, 2.0, 4.0] if make is turn_env else [1.0, 2.0])
 
 
-def test_team_reward_of_a_round_is_paid_to_each_live_agent():
+def test_parallel_env_pays_the_team_reward_to_each_live_agent():
     ant, bee = agents()
     env = parallel_env(calling(ant, bee, ant, bee), [ant, bee], team_reward=Counter(100, 1, 2))
     env.reset()
@@ -88,7 +88,7 @@ def test_team_reward_of_a_round_is_paid_to_each_live_agent():
     assert [env.step({"ant_0": 1, "bee_0": 1})[1] for _ in range(2)] == [1.0, 2.0]
 
 
-def test_items_of_split_calls_earn_the_teams_reward():
+def test_split_items_earn_the_team_reward():
     bid = define(split=lambda items: items, agent=lambda item: item)(lambda items: items)
     env = turn_env(
         script(lambda simulation: bid(["ant", "bee"])), bid, team_reward=Counter(100, 1, 2)
@@ -97,7 +97,7 @@ def test_items_of_split_calls_earn_the_teams_reward():
     assert [env.step(0)[1] for _ in range(2)] == [1.0, 2.0]
 
 
-def test_a_reward_that_is_no_number_is_refused():
+def test_team_reward_that_is_no_number_is_refused():
     ant, _ = agents()
     env = aec_env(calling(ant), [ant], team_reward=lambda simulation: None)
     with pytest.raises(RewardError, match="is not one number"):
@@ -116,7 +116,7 @@ def earned(yard):
 
 @given(yard_designs, seeds)
 @examples(60)
-def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, seed):
+def test_team_rewards_add_up_from_the_first_decision_to_the_end(design, seed):
     options = {
         "possible_agents": YARD_ROSTER,
         "team_reward": difference(earned),
@@ -156,7 +156,7 @@ def test_rewards_add_up_to_the_total_from_the_first_decision_to_the_end(design, 
 
 @given(yard_designs, seeds)
 @examples(30)
-def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, seed):
+def test_parallel_env_agents_get_the_team_reward_since_they_joined(design, seed):
     env = parallel_env(
         lambda: Yard(design),
         YARD_POINTS,
@@ -183,7 +183,7 @@ def test_each_agent_of_a_parallel_view_gets_the_total_since_it_joined(design, se
     env.close()
 
 
-def test_clones_go_on_with_the_teams_reward():
+def test_clone_continues_the_team_reward():
     ant, bee = agents()
 
     def main(simulation):

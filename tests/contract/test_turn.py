@@ -11,8 +11,22 @@ from hypothesis import given
 from simenv_marl import RULE, aec_env, clone, generate_env, turn_env, vector_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError, UnknownOptionError, ViewError
 from tests.extent import examples
-from tests.worlds import random_worlds
 from tests.worlds.models import Timed, calling, decision, script
+from tests.worlds.random_worlds import (
+    YARD_POINTS,
+    YARD_ROSTER,
+    World,
+    Yard,
+    YardDesign,
+    answers,
+    legal,
+    points_of,
+    seeds,
+    world_designs,
+    world_policies,
+    yard_designs,
+    yard_policy,
+)
 
 
 def vector(low, high, size=1):
@@ -67,33 +81,30 @@ def compared(aec, turn, seed, action_of):
     turn.close()
 
 
-@given(random_worlds.yard_designs, random_worlds.seeds)
+@given(yard_designs, seeds)
 @examples(60)
-def test_turn_view_with_births_and_deaths_matches_the_aec_view(design, seed):
-    options = {"possible_agents": random_worlds.YARD_ROSTER}
+def test_turn_env_with_births_and_deaths_matches_aec_env(design, seed):
+    options = {"possible_agents": YARD_ROSTER}
     compared(
-        aec_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
-        turn_env(lambda: random_worlds.Yard(design), random_worlds.YARD_POINTS, **options),
+        aec_env(lambda: Yard(design), YARD_POINTS, **options),
+        turn_env(lambda: Yard(design), YARD_POINTS, **options),
         seed,
-        lambda observation, info: random_worlds.yard_policy(observation),
+        lambda observation, info: yard_policy(observation),
     )
 
 
-@given(random_worlds.world_designs(), random_worlds.seeds, random_worlds.answers)
+@given(world_designs(), seeds, answers)
 @examples(100)
-def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
-    points = random_worlds.points_of(design)
-    policies = {points[point]: random_worlds.world_policy for point in design.policies} | {
-        points[point]: RULE for point in design.rules
-    }
-    options = {"policies": policies or None, "max_steps": design.max_steps}
-    given_answers = iter(answers)
+def test_turn_env_matches_aec_env_in_random_models(design, seed, given_answers):
+    points = points_of(design)
+    options = {"policies": world_policies(design, points), "max_steps": design.max_steps}
+    remaining = iter(given_answers)
     compared(
-        aec_env(lambda: random_worlds.World(design, points), points, **options),
-        turn_env(lambda: random_worlds.World(design, points), points, **options),
+        aec_env(lambda: World(design, points), points, **options),
+        turn_env(lambda: World(design, points), points, **options),
         seed,
-        lambda observation, info: random_worlds.legal(
-            next(given_answers), {k: v for k, v in info.items() if k == "action_mask"}
+        lambda observation, info: legal(
+            next(remaining), {k: v for k, v in info.items() if k == "action_mask"}
         ),
     )
 
@@ -101,7 +112,7 @@ def test_turn_view_of_random_worlds_matches_the_aec_view(design, seed, answers):
 # -- spaces ---------------------------------------------------------------------------------------
 
 
-def test_turn_observation_adds_kind_and_index_of_the_agent():
+def test_turn_env_observation_adds_kind_and_index_of_the_agent():
     ant = decision(agent=lambda: "ant_1")
     bee = decision(agent="bee_0", observation_space_mapping=lambda: [3.0, 4.0])
     env = turn_env(calling(ant, bee), [ant, bee])
@@ -126,7 +137,7 @@ def test_turn_observation_adds_kind_and_index_of_the_agent():
     assert observation.tolist() == [*one_hot(2, 3), *one_hot(1, 2), 3.0, 4.0]
 
 
-def test_different_observations_are_flattened_and_padded_with_zeros():
+def test_turn_env_flattens_different_observations_and_pads_with_zeros():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Discrete(3),
@@ -153,7 +164,7 @@ def test_different_observations_are_flattened_and_padded_with_zeros():
         turn_env(calling(ant, text), [ant, text])
 
 
-def test_discrete_actions_of_a_turn_view_share_one_masked_space():
+def test_turn_env_unites_discrete_actions_in_one_masked_space():
     mask = np.array([0, 1], np.int8)
     ant = decision(
         agent="ant_0", action_space=spaces.Discrete(2, start=5), action_mask_mapping=lambda: mask
@@ -175,7 +186,7 @@ def test_discrete_actions_of_a_turn_view_share_one_masked_space():
     assert env.simulation.log == [6, 3]
 
 
-def test_box_actions_of_a_turn_view_are_scaled_to_each_agents_bounds():
+def test_turn_env_scales_box_actions_to_each_agents_bounds():
     ant = decision(agent="ant_0", **vector(0, 10))
     bee = decision(agent="bee_0", **vector(-1, 3, 2))
     whole = decision(
@@ -202,7 +213,7 @@ def test_box_actions_of_a_turn_view_are_scaled_to_each_agents_bounds():
         turn_env(calling(ant, unbounded), [ant, unbounded])
 
 
-def test_discrete_actions_beside_boxes_are_chosen_by_preference():
+def test_turn_env_chooses_discrete_actions_beside_boxes_by_largest_value():
     mask = np.array([1, 0, 1], np.int8)
     ant = decision(
         agent="ant_0",
@@ -228,7 +239,7 @@ def test_discrete_actions_beside_boxes_are_chosen_by_preference():
 # -- rewards, infos, ends -------------------------------------------------------------------------
 
 
-def test_elapsed_times_and_discounts_count_from_the_last_step():
+def test_turn_env_elapsed_time_and_discount_count_from_the_last_step():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def main(simulation):
@@ -243,7 +254,7 @@ def test_elapsed_times_and_discounts_count_from_the_last_step():
     assert infos[1]["discount"] == pytest.approx(math.exp(-1))
 
 
-def test_the_last_observation_is_that_of_the_agent_that_decided_last():
+def test_turn_env_last_observation_is_of_the_agent_that_decided_last():
     level = [0]
 
     def main(simulation):
@@ -265,12 +276,12 @@ def test_the_last_observation_is_that_of_the_agent_that_decided_last():
         env.step(1)
 
 
-def test_clone_of_a_turn_view_continues_like_the_original():
-    design = random_worlds.YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
+def test_clone_of_turn_env_continues_like_the_original():
+    design = YardDesign(machines=3, jobs=3, cranes=2, plans=2, luck=3, until=None)
     env = turn_env(
-        lambda: random_worlds.Yard(design),
-        random_worlds.YARD_POINTS,
-        possible_agents=random_worlds.YARD_ROSTER,
+        lambda: Yard(design),
+        YARD_POINTS,
+        possible_agents=YARD_ROSTER,
     )
     env.reset(seed=5)
     env.step(2)
@@ -295,7 +306,7 @@ def test_clone_of_a_turn_view_continues_like_the_original():
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_turn_view_passes_check_env_and_works_in_vectors(flatten):
+def test_turn_env_passes_check_env_and_works_in_vector_env(flatten):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **vector(0, 1))
     options = {"flatten": flatten}
     check_env(turn_env(calling(ant, bee, ant), [ant, bee], **options), skip_render_check=True)
@@ -316,7 +327,7 @@ def test_turn_view_passes_check_env_and_works_in_vectors(flatten):
     vectors.close()
 
 
-def test_infos_of_the_turn_view_contain_states_on_request():
+def test_turn_env_infos_contain_the_state_on_request():
     class Counting:
         def reset(self):
             self.count = 0

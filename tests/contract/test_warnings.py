@@ -85,7 +85,9 @@ def play(env, draw=lambda: None):
     ],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
-def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset):
+def test_env_warns_once_of_a_model_that_uses_global_random_generators(
+    heard_alone, draw, name, in_reset
+):
     kind = gambler(draw, in_reset=in_reset)
     for make in (single_env, aec_env):
         for _ in range(2):
@@ -103,12 +105,12 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
     ),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-def test_all_runners_warn_of_draws_from_global_generators(heard_alone, run):
+def test_all_env_functions_warn_of_use_of_global_random_generators(heard_alone, run):
     run(gambler(random.random))
     assert len(heard_alone(DRAWS)) == 1
 
 
-def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard):
+def test_env_does_not_warn_of_a_users_own_random_generators(heard):
     def draw():
         return random.random() + np.random.random()
 
@@ -127,7 +129,7 @@ def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard):
     assert heard(DRAWS) == []
 
 
-def test_draws_of_other_threads_cause_no_warning(heard):
+def test_env_does_not_warn_of_random_draws_in_other_threads(heard):
     over, draws_going_on = threading.Event(), threading.Event()
 
     def draw():
@@ -168,9 +170,9 @@ ANTS = hill("ant_0", "ant_1")
         ({"policies": {"ant_O": lambda observation: 1}}, "ant_O"),
         ({"possible_agents": ["ant_0", "ant_1", "ant_2"]}, "ant_2"),
     ],
-    ids=["policies", "a roster"],
+    ids=["policies", "possible_agents"],
 )
-def test_agent_that_never_appears_is_warned_of_once_at_episode_end(heard, options, absent):
+def test_env_warns_once_of_a_possible_agent_that_never_appears(heard, options, absent):
     env = aec_env(ANTS, ant, **options)
     for _ in range(2):
         play_in_turns(env, seed=1)
@@ -181,7 +183,7 @@ def test_agent_that_never_appears_is_warned_of_once_at_episode_end(heard, option
     assert "ant_0, ant_1" in those_who_came
 
 
-def test_runners_warn_once_of_an_agent_that_never_appears(heard):
+def test_simulate_warns_once_of_a_possible_agent_that_never_appears(heard):
     policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
     simulate_many(ANTS, policies, seeds=range(5), points=ant)
     assert len(heard(ABSENT)) == 1
@@ -189,7 +191,7 @@ def test_runners_warn_once_of_an_agent_that_never_appears(heard):
     assert len(heard(ABSENT)) == 2
 
 
-def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard):
+def test_env_does_not_warn_of_absent_agents_in_unfinished_episodes(heard):
     names = ["nest.1", "ant_0"]  # a dot makes no path
     play_in_turns(
         aec_env(
@@ -207,7 +209,7 @@ def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard):
 
 
 @pytest.mark.parametrize("slip", ["threading.Thread.strat", f"{__name__}.Missing.step"])
-def test_policies_for_names_without_a_function_are_refused(slip):
+def test_aec_env_refuses_policies_for_names_that_do_not_exist(slip):
     with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
         aec_env(ANTS, ant, policies={slip: lambda observation: 0})
 
@@ -215,7 +217,7 @@ def test_policies_for_names_without_a_function_are_refused(slip):
 # -- rounds that stand still ----------------------------------------------------------------------
 
 
-def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard):
+def test_parallel_env_warns_if_steps_never_have_the_waiting_agents_action(heard):
     env = begun(parallel_env(ANTS, ant, possible_agents=["ant_0", "ant_1"]), 1)
     for number in range(150):
         env.step({"ant_1": 1} if number % 2 else {})
@@ -227,7 +229,7 @@ def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard):
     assert env.agents == []
 
 
-def test_agents_acting_in_turns_cause_no_standstill_warning(heard):
+def test_parallel_env_does_not_warn_if_agents_act_in_turns(heard):
     one, two = decision(agent="one"), decision(agent="two")
     env = begun(parallel_env(calling(*[one, two] * 400), [one, two]), 1)
     for number in range(600):
@@ -275,7 +277,7 @@ OVERRIDE = "objects of these classes are no agents"
 DRAIN = f"{__name__}.Tank.drain"
 
 
-def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard):
+def test_env_warns_of_a_subclass_method_that_hides_a_decision_point(heard):
     env = begun(aec_env(tanks(Tank, Deaf), {DRAIN: define()}))
     env.step(1)
     assert not heard(OVERRIDE)
@@ -289,7 +291,7 @@ def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard)
     assert not hasattr(Deaf.drain, "__wrapped__")
 
 
-def test_a_static_function_that_overrides_a_point_is_warned_of(heard):
+def test_env_warns_of_a_static_method_that_hides_a_decision_point(heard):
     model = calling(lambda: Tank.fill(1), lambda: Deaf.fill(2))
     assert simulate(model, {}, points={f"{__name__}.Tank.fill": define()}).log == ["rule", "deaf"]
     assert not heard(OVERRIDE)  # the rule decides everywhere
@@ -307,12 +309,12 @@ def test_a_static_function_that_overrides_a_point_is_warned_of(heard):
         (tanks(Tank, Deaf), {DRAIN: define(), f"{__name__}.Deaf.drain": define()}),
     ],
 )
-def test_an_override_that_decides_is_not_warned_of(model, points, heard):
+def test_env_does_not_warn_of_an_override_that_is_a_decision_point(model, points, heard):
     play_in_turns(aec_env(model, points), 1)
     assert not heard(OVERRIDE)
 
 
-def test_an_override_may_run_in_a_thread_of_the_model(heard):
+def test_env_accepts_an_overridden_decision_point_in_a_models_thread(heard):
     def main(simulation):
         thread = threading.Thread(target=lambda: simulation.log.append(Deaf().drain()))
         thread.start()
@@ -327,7 +329,7 @@ def test_an_override_may_run_in_a_thread_of_the_model(heard):
 # -- names of agents, and functions that end them -------------------------------------------------
 
 
-def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard):
+def test_env_warns_once_if_end_agent_names_an_unknown_agent(heard):
     for ending, expected in [("1 ends", 0), ("1 ends, 1 ends", 0), ("7 ends, 8 ends", 1)]:
         env = aec_env(life(f"0 acts, 1 acts, {ending}, 0 acts"), beings())
         play_in_turns(env, 1)
@@ -338,7 +340,7 @@ def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard):
     assert "these have: being_0, being_1" in texts[0]
 
 
-def test_declared_agents_may_end_before_they_decide(heard):
+def test_possible_agents_may_end_before_their_first_decision(heard):
     roster = ["being_0", "being_1", "being_2"]
     env = aec_env(life("0 acts, 1 acts, 2 ends, 0 acts"), beings(), possible_agents=roster)
     play_in_turns(env, 1)
@@ -348,7 +350,7 @@ def test_declared_agents_may_end_before_they_decide(heard):
 PAIR, DYING = life("0 acts, 1 acts, 0 acts"), life("0 acts, 1 acts, 1 leaves, 0 acts")
 
 
-def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard):
+def test_env_warns_once_if_two_objects_have_one_agent_name(heard):
     env = aec_env(PAIR, beings(agent=lambda being: "ant"))
     play_in_turns(env, 1)
     play_in_turns(env, 1)
@@ -360,7 +362,7 @@ def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard):
 
 
 @pytest.mark.parametrize("deciders", [{}, {"one": lambda _: 1}])
-def test_two_items_of_a_call_under_one_name_are_warned_of_once(deciders, heard):
+def test_env_warns_once_if_two_split_items_have_one_agent_name(deciders, heard):
     class Yard:
         def allot(self):
             return [0, 0, 0, 0]
@@ -388,7 +390,7 @@ LEAVE = f"{HERE}.Being.leave"
 
 @pytest.mark.parametrize("key", [Being.leave, LEAVE])
 @pytest.mark.parametrize("form", [lambda key: key, lambda key: [key], lambda key: {key: None}])
-def test_functions_that_end_agents_are_named_as_points_are(key, form, heard):
+def test_removed_by_takes_functions_or_dotted_names_and_survives_pickling(key, form, heard):
     env = aec_env(DYING, beings(removed_by=form(key)))
     for _ in range(2):
         assert story(play_in_turns(env, 1)) == "0 1 1+ 0 0+"
@@ -397,7 +399,7 @@ def test_functions_that_end_agents_are_named_as_points_are(key, form, heard):
     assert len(play_in_turns(copied, 1)) == 5
 
 
-def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard):
+def test_env_warns_once_if_a_removed_by_function_is_never_called(heard):
     play_in_turns(aec_env(PAIR, beings()), 1)  # nobody can have been removed
     env = begun(aec_env(life("1 acts, 0 acts, 0 acts, 0 acts"), beings()))
     env.close()

@@ -7,7 +7,7 @@ import pytest
 from simenv_marl.core.switching.awaiting import Answers, wait_for
 
 
-def test_answers_of_coroutines_are_returned_with_their_keys():
+def test_coroutine_policies_answers_are_returned_with_their_decisions_keys():
     async def double(number):
         await asyncio.sleep(0)
         return 2 * number
@@ -21,7 +21,7 @@ def test_answers_of_coroutines_are_returned_with_their_keys():
     assert not answers
 
 
-def test_cancel_waits_for_coroutines_and_drops_answers_that_have_come():
+def test_coroutine_policies_that_are_cancelled_end_and_lose_their_answers():
     ended = []
 
     async def wait():
@@ -42,7 +42,7 @@ def test_cancel_waits_for_coroutines_and_drops_answers_that_have_come():
 
 
 @pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt, SystemExit])
-def test_errors_of_coroutines_are_raised_where_the_answer_is_read(kind):
+def test_errors_of_coroutine_policies_are_raised_where_the_answer_is_read(kind):
     async def fail():
         raise kind("no")
 

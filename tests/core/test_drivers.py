@@ -51,7 +51,7 @@ def _nobody_is_running_afterwards():
 
 
 @EVERY_DRIVER
-def test_simulation_runs_on_one_stack_in_one_context():
+def test_simulation_runs_on_one_stack_with_one_set_of_context_variables():
     variable = contextvars.ContextVar("variable", default="nobody's")
     seen = []
 
@@ -116,7 +116,7 @@ def test_simulation_runs_on_one_stack_in_one_context():
 
 @EVERY_DRIVER
 @pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_other_threads_run_rules_and_environments_meanwhile(inner):
+def test_other_threads_can_use_models_and_envs_while_an_env_steps(inner):
     decide, other = decision(), decision(lambda: "its rule")
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
@@ -153,7 +153,7 @@ WAYS = {
 @EVERY_DRIVER
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_decisions_in_threads_of_the_model_fail_the_step(way, last):
+def test_env_step_raises_an_error_if_a_models_thread_decides(way, last):
     def work():
         roots.append(weakref.ref(greenlet.getcurrent()))
         decide()
@@ -182,7 +182,7 @@ def test_decisions_in_threads_of_the_model_fail_the_step(way, last):
 
 
 @EVERY_DRIVER
-def test_wrong_thread_error_is_raised_once_or_noted_on_another_error():
+def test_wrong_thread_error_is_raised_once_or_noted_on_the_models_error():
     def passed_on():
         return by_pool(decide)
 
@@ -218,7 +218,7 @@ class InTurn(futures.Executor):
 
 
 @EVERY_DRIVER
-def test_sequential_executor_can_replace_a_thread_pool_of_the_model(monkeypatch):
+def test_model_with_a_thread_pool_can_use_a_sequential_executor_instead(monkeypatch):
     def main(simulation):
         with futures.ThreadPoolExecutor() as pool:
             simulation.log += pool.map(lambda number: (number, decide()), range(3))
@@ -239,7 +239,7 @@ def test_sequential_executor_can_replace_a_thread_pool_of_the_model(monkeypatch)
 
 @EVERY_DRIVER
 @pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
-def test_decisions_in_threads_older_than_the_episode_are_refused(how):
+def test_decision_in_a_thread_older_than_the_episode_is_refused(how):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)
@@ -290,7 +290,7 @@ run = partial(
 
 
 @needs_fork
-def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
+def test_forked_process_must_reset_a_thread_driver_env():
     said = run("""
         env = single_env(calling(decide, decide), decide, driver="thread")
         inside, go_on = threading.Event(), threading.Event()
@@ -329,7 +329,7 @@ def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
 
 
 @needs_fork
-def test_uncaught_errors_of_a_forked_model_in_a_thread_are_printed():
+def test_forked_process_of_a_model_in_a_thread_prints_uncaught_errors():
     said = run("""
         def main(simulation):
             decide()
@@ -350,7 +350,7 @@ def test_uncaught_errors_of_a_forked_model_in_a_thread_are_printed():
 @pytest.mark.parametrize(
     "where", ["suspended", "closed", "inside", "in a thread", "in daemons", "moving"]
 )
-def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
+def test_python_exits_cleanly_with_envs_in_mid_episode(driver, where):
     said = run(f"""
         where = {where!r}
         ready, never = threading.Event(), threading.Event()
@@ -396,7 +396,7 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
 
 @DRIVERS
 @pytest.mark.parametrize(("end", "status"), [("sys.exit(3)", 3), ("os._exit(4)", 4)])
-def test_a_model_may_end_the_process(driver, end, status):
+def test_model_can_end_the_python_process(driver, end, status):
     said = run(
         f"""
         def main(simulation):
@@ -412,7 +412,7 @@ def test_a_model_may_end_the_process(driver, end, status):
     assert said == ""
 
 
-def test_starting_threads_is_watched_only_while_there_are_simulations():
+def test_thread_start_is_patched_only_while_environments_exist():
     said = run("""
         original = threading.Thread.start
         env = single_env(calling(decide), decide)

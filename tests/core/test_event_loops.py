@@ -91,7 +91,7 @@ NOTHING = (None, (None, None), 0)
 
 
 @DRIVERS
-def test_a_user_without_a_loop_keeps_generator_hooks_and_tracking(driver):
+def test_env_of_an_asyncio_model_keeps_the_users_async_generator_hooks(driver):
     def hook(generator):
         """What takes note of asynchronous generators."""
 
@@ -114,7 +114,7 @@ def test_a_user_without_a_loop_keeps_generator_hooks_and_tracking(driver):
 
 @EVERY_DRIVER
 @pytest.mark.parametrize("inside", [(), (1, 2, 3, 4, 5), (0, 1), (5,)])
-def test_a_users_loop_keeps_its_generator_hooks_and_tracking(inside):
+def test_env_in_a_users_event_loop_keeps_its_async_generator_hooks(inside):
     """The reset and five steps are made inside a loop of the user's, or outside all."""
 
     async def act(move):
@@ -166,7 +166,7 @@ def deciding(driver, interrupted=False):
 
 
 @DRIVERS
-def test_an_interrupt_between_steps_reaches_the_users_handler(driver):
+def test_keyboard_interrupt_between_steps_reaches_the_users_signal_handler(driver):
     caught = []
 
     def handler(number, frame):
@@ -190,7 +190,7 @@ def test_an_interrupt_between_steps_reaches_the_users_handler(driver):
     assert env.simulation.log == [0, 1, 2, 3]
 
 
-def test_an_interrupt_while_the_model_computes_reaches_its_loop():
+def test_keyboard_interrupt_in_an_asyncio_model_reaches_its_event_loop():
     env = deciding("greenlet", interrupted=True)
     env.step(1)
     with pytest.raises(KeyboardInterrupt):
@@ -229,7 +229,7 @@ async def waited(clerk):
 @pytest.mark.parametrize("way", [grouped, gathered, waited])
 @pytest.mark.parametrize("steps", [0, 1])
 @pytest.mark.parametrize("how", ["close", "reset", "collected"])
-def test_tasks_that_are_unwound_are_not_reported(way, steps, how, loud):
+def test_env_close_reports_no_errors_of_unwound_asyncio_tasks(way, steps, how, loud):
     decide = decision()
     env = begun(single_env(script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide))
     for _ in range(steps):
@@ -242,7 +242,7 @@ def test_tasks_that_are_unwound_are_not_reported(way, steps, how, loud):
 
 
 @EVERY_DRIVER
-def test_errors_of_tasks_are_reported_while_others_are_unwound(loud):
+def test_env_close_reports_errors_of_asyncio_tasks_that_fail_on_their_own(loud):
     async def fail():
         raise ValueError
 
@@ -299,7 +299,7 @@ async def office(simulation, decide, cleanup):
 
 @EVERY_DRIVER
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_a_loop_of_the_model_cancels_its_tasks_at_the_end(end):
+def test_asyncio_models_event_loop_cancels_its_tasks_at_the_end(end):
     decide, cleanup = decision(), []
     env = begun(
         single_env(
@@ -329,7 +329,7 @@ class Lasting(SimulationInterface):
 
 
 @EVERY_DRIVER
-def test_event_loop_kept_over_episodes_is_patched_once(loud):
+def test_event_loop_that_a_model_keeps_over_episodes_is_patched_once(loud):
     decide, messages = decision(), []
     env = single_env(lambda: Lasting(clerk_of(decide)), decide)
     model = env.simulation
@@ -350,7 +350,7 @@ def test_event_loop_kept_over_episodes_is_patched_once(loud):
 
 
 @pytest.mark.parametrize(("driver", "number"), [("greenlet", 1), ("thread", 3)])
-def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, number):
+def test_trio_models_run_one_at_a_time_or_side_by_side_in_threads(driver, number):
     trio, decide = pytest.importorskip("trio"), decision()
 
     async def work(simulation):
@@ -372,7 +372,7 @@ def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, n
 @pytest.mark.filterwarnings(
     "ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
-def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations():
+def test_env_reset_raises_an_error_if_a_kept_event_loop_has_old_tasks():
     """A loop that outlives its episodes keeps their tasks and passes on their exit later."""
     decide, raised = decision(), None
     env = single_env(lambda: Lasting(partial(gathered, clerk_of(decide))), decide)

@@ -70,7 +70,7 @@ def run(code, driver):
 
 
 @DRIVERS
-def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(driver):
+def test_process_pool_that_a_model_forks_in_run_cannot_decide(driver):
     run(
         """
         for _ in range(2):
@@ -81,7 +81,7 @@ def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(driver):
 
 
 @DRIVERS
-def test_workers_that_were_forked_before_the_model_runs_have_the_rule(driver):
+def test_process_pool_forked_before_run_follows_the_models_rule(driver):
     run(
         """
         class Model(Script):
@@ -97,7 +97,7 @@ def test_workers_that_were_forked_before_the_model_runs_have_the_rule(driver):
 
 
 @DRIVERS
-def test_a_forked_worker_uses_environments_of_its_own(driver):
+def test_forked_worker_process_can_use_environments_of_its_own(driver):
     run(
         """
         def play_own(queue):

@@ -53,7 +53,7 @@ RULED = """
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @pytest.mark.parametrize("first", ["user", "model"])
 @pytest.mark.parametrize("where", ["main", "spawned"])
-def test_a_call_on_the_users_side_of_a_hub_runs_the_rule(where, first, driver):
+def test_gevent_decision_in_the_users_greenlets_follows_the_models_rule(where, first, driver):
     """Whichever of the two has used the hub first, and wherever the user steps."""
     if (where, first, driver) == ("main", "model", "greenlet"):
         return  # a hub that begins in a simulation belongs to it
@@ -92,7 +92,7 @@ def test_a_call_on_the_users_side_of_a_hub_runs_the_rule(where, first, driver):
     ],
     ids=["spawned", "in turn", "raw"],
 )
-def test_greenlets_that_a_model_spawns_on_the_users_hub_are_refused(how, first):
+def test_gevent_model_that_spawns_greenlets_on_the_users_hub_is_refused(how, first):
     run(
         f"""
         if {first!r} == "user":
@@ -116,7 +116,7 @@ def test_greenlets_that_a_model_spawns_on_the_users_hub_are_refused(how, first):
     )
 
 
-def test_greenlets_that_a_model_spawns_on_a_hub_of_its_own_decide():
+def test_gevent_model_with_a_hub_of_its_own_can_decide_in_greenlets():
     run(
         """
         def main(simulation):
@@ -136,7 +136,7 @@ def test_greenlets_that_a_model_spawns_on_a_hub_of_its_own_decide():
 
 
 @pytest.mark.parametrize("how", ["close", "reset"])
-def test_a_model_that_waits_in_the_hub_unwinds(how):
+def test_gevent_model_that_waits_in_its_hub_is_unwound_by_env_close(how):
     run(
         f"""
         unwound = []
@@ -183,7 +183,7 @@ PATCHED = """
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
-def test_threads_that_gevent_has_replaced_are_refused(driver):
+def test_thread_driver_refuses_threads_that_gevent_has_patched(driver):
     told = run_code(f"driver = {driver!r}", PATCHED.format(""))
     assert "patch_all(thread=False, queue=False)" in told
     assert run_code(f"driver = {driver!r}", PATCHED.format("thread=False, queue=False")) == "end\n"

@@ -73,7 +73,7 @@ def plain(seed):
 
 @EVERY_DRIVER
 @EVERY_VIEW
-def test_global_rng_draws_match_plain_runs_despite_other_draws(view):
+def test_global_rng_repeats_the_models_draws_despite_other_draws(view):
     logs = {seed: plain(seed) for seed in (7, 8)}
     envs = {seed: view(Casino, {BET: define(agent="player_0")}, global_rng=True) for seed in logs}
 
@@ -112,7 +112,7 @@ def test_global_generators_are_shared_unless_global_rng_is_set():
         aec_env(Casino, POINTS, global_rng=1)
 
 
-def test_errors_give_the_generators_back():
+def test_global_rng_restores_the_users_generators_after_an_error():
     before = world()
     broken = define(agent="player_0", observation_space_mapping=lambda casino, card: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -127,7 +127,7 @@ class Seeding(Casino):
         self.log = [self.bet(0)]
 
 
-def test_simulations_may_seed_the_generators_themselves():
+def test_global_rng_allows_simulations_to_seed_the_generators():
     before = world()
     policies = {BET: lambda observation: int(observation[0])}
     one, other = (
@@ -137,7 +137,7 @@ def test_simulations_may_seed_the_generators_themselves():
     assert world() == before
 
 
-def test_other_bit_generators_of_the_user_stay():
+def test_global_rng_keeps_the_users_numpy_bit_generator():
     ours = np.random.get_bit_generator()
     theirs = np.random.PCG64(3)
     np.random.set_bit_generator(theirs)
@@ -152,7 +152,7 @@ def test_other_bit_generators_of_the_user_stay():
 
 
 @EVERY_DRIVER
-def test_global_rng_works_for_a_run_nested_in_another():
+def test_global_rng_works_for_nested_environments():
     """The state of the outer one is in place in its simulation's thread, too."""
 
     class Gambler(Casino):
@@ -164,7 +164,7 @@ def test_global_rng_works_for_a_run_nested_in_another():
     assert outer.inner.log == outer.log == plain(3)
 
 
-def test_global_rng_environments_in_two_threads_at_once_are_refused():
+def test_global_rng_refuses_environments_in_two_threads_at_once():
     """There is one state of the global generators in a process, and whoever is at work has it."""
     other, errors = aec_env(Casino, POINTS, global_rng=True), []
 

@@ -111,7 +111,7 @@ def begin(model, driver, envs):
         pytest.param(Caches, Caches, marks=pytest.mark.skipif(not ONE_LOCK, reason="has no lock")),
     ],
 )
-def test_a_lock_that_a_suspended_simulation_holds_is_an_error(driver, holder, waiter):
+def test_env_raises_an_error_if_a_model_waits_for_another_models_lock(driver, holder, waiter):
     if driver == "greenlet" and holder is Caches:
         pytest.skip("greenlets of a thread share its RLock")
     first = env_of(holder, driver)
@@ -131,7 +131,7 @@ def test_a_lock_that_a_suspended_simulation_holds_is_an_error(driver, holder, wa
 
 
 @DRIVERS
-def test_lock_wait_in_another_thread_is_reported_on_stderr(driver, capfd):
+def test_env_reports_on_stderr_a_lock_wait_in_another_thread(driver, capfd):
     def use():
         first.reset()
         second.reset()  # waits
@@ -206,7 +206,7 @@ class Leaves(Sleeps):
 
 @DRIVERS
 @pytest.mark.parametrize("model", [Sleeps, Lends, Leaves])
-def test_wait_for_a_lock_that_ends_is_not_reported(driver, model, capfd):
+def test_env_does_not_report_a_short_wait_for_a_lock(driver, model, capfd):
     first = env_of(Leaves if model is Leaves else Lends if model is Lends else Model, driver)
     second = env_of(model, driver)
     first.reset()
@@ -234,7 +234,7 @@ def fork():
 
 
 @pytest.mark.skipif(not LISTED, reason=NOT_LISTED)
-def test_fork_ends_the_thread_that_watches_locks():
+def test_forked_process_has_no_thread_that_watches_locks():
     alone = fork()  # threads of NumPy end at forks, too
     listed = threading.enumerate()
     first, second = [env_of(Model, "greenlet") for _ in range(2)]

@@ -58,11 +58,11 @@ SYSTEM = (sys.platform, platform.machine())
 
 
 @pytest.mark.skipif(SYSTEM != ("linux", "x86_64"), reason="there is no begin of stacks elsewhere")
-def test_a_native_stack_trace_ends_at_the_begin_of_the_stack():
+def test_native_stack_trace_in_a_simulation_ends_where_its_stack_begins():
     alone(trace_at_all_depths)
 
 
-def test_warning_names_libraries_with_unsafe_native_stack_traces(monkeypatch):
+def test_env_warns_of_libraries_with_unsafe_native_stack_traces(monkeypatch):
     monkeypatch.setattr(greenlets, "_definition", lambda: None)
     monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
     greenlets.warn_of_native_traces.cache_clear()

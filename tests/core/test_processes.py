@@ -151,7 +151,7 @@ def assert_alike(one, other):
 
 
 @pytest.mark.parametrize("make", ERRORS.values(), ids=ERRORS)
-def test_errors_sent_between_processes_keep_notes_and_causes(make):
+def test_errors_from_worker_processes_keep_notes_and_causes(make):
     error = make()
     again = unpack_error(pack_error(error))
     assert again is not error
@@ -171,9 +171,9 @@ class Recalcitrant(Unspeakable):
 @pytest.mark.parametrize(
     "error",
     [Many("some", "thing", "more"), Recalcitrant(), Slotted(4)],
-    ids=["unpicklable", "recalcitrant", "slots"],
+    ids=["unpicklable", "pickling fails", "slots"],
 )
-def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error):
+def test_unpicklable_errors_of_worker_processes_arrive_as_text_with_notes(error):
     noted(caused(error, raised(open, "/nowhere")), "a note").held = (part for part in ())
     again = unpack_error(pack_error(error))
     assert type(again) is WorkerError
@@ -193,7 +193,7 @@ def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error
 
 
 @pytest.mark.parametrize("notes", ["text", 3, None, ("one", "two"), {}, [3, "one"], [[]]], ids=str)
-def test_errors_with_malformed_notes_cross_to_other_processes(notes):
+def test_errors_with_malformed_notes_arrive_from_worker_processes(notes):
     error = ValueError("noted")
     error.__notes__ = notes
     again = unpack_error(pack_error(error))

@@ -78,7 +78,7 @@ class Crowd:
 
 
 @given(st.integers(0, 2**80), st.integers(0, 7))
-def test_reseeding_gives_the_same_states_after_any_earlier_draws(seed, before):
+def test_reseed_generators_gives_the_same_state_after_any_earlier_draws(seed, before):
     one, other = Crowd(1), Crowd(2)
     for _ in range(before):
         other.drawn()
@@ -94,7 +94,7 @@ def test_reseeding_gives_the_same_states_after_any_earlier_draws(seed, before):
 
 
 @pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937, np.random.Philox])
-def test_spawned_generators_are_reseeded_too(kind):
+def test_reseed_generators_reseeds_spawned_numpy_generators(kind):
     """Where NumPy can put that back into a generator at all."""
     generator = np.random.Generator(kind(1))
     spawned = generator.spawn(1)[0].random()
@@ -105,7 +105,7 @@ def test_spawned_generators_are_reseeded_too(kind):
     assert generator.bit_generator.random_raw() != kind(1).random_raw()
 
 
-def test_reseeded_generators_differ_from_ones_seeded_directly():
+def test_reseed_generators_differs_from_seeding_generators_directly():
     one, other, legacy = random.Random(), np.random.default_rng(), np.random.RandomState()
     reseed_generators([one, other, legacy], 7)
     drawn = {one.random(), other.random(), legacy.random()}
@@ -114,7 +114,7 @@ def test_reseeded_generators_differ_from_ones_seeded_directly():
     assert drawn.isdisjoint([random.Random(7).random(), np.random.RandomState(7).random(), *plain])
 
 
-def test_reseeding_needs_generators_other_than_the_global_ones():
+def test_reseed_generators_refuses_models_with_only_global_generators():
     model = SimpleNamespace(
         random=random, draw=random.random, numpy=np.random.mtrand._rand, function=world
     )
@@ -131,7 +131,7 @@ def test_reseeding_needs_generators_other_than_the_global_ones():
 
 
 @pytest.mark.parametrize("seed", [-1, True, 1.5, "7"])
-def test_seeds_are_integers(seed):
+def test_reseed_generators_and_streams_refuse_seeds_that_are_no_integers(seed):
     for refused in (
         Streams,
         Streams(1).reseed,
@@ -148,7 +148,7 @@ def draws(streams, *names):
     return [streams[name].random() for name in names]
 
 
-def test_stream_depends_only_on_the_seed_and_its_name():
+def test_random_stream_depends_only_on_the_seed_and_its_name():
     one, other = Streams(3), Streams(3)
     other["b"].random(100)
     assert draws(one, "a", "a") == draws(other, "a", "a")
@@ -207,7 +207,7 @@ NAMES = [
 ]
 
 
-def test_named_streams_are_the_same_in_each_process():
+def test_random_streams_are_the_same_in_each_process():
     here = draws(Streams(3), *NAMES)
     assert len(set(here)) == len(here)
     code = "from tests.core.test_reseeding import *; print(draws(Streams(3), *NAMES))"
@@ -216,11 +216,11 @@ def test_named_streams_are_the_same_in_each_process():
         assert text.strip() == str(here)
 
 
-def test_named_stream_draws_the_same_numbers_in_every_version():
+def test_random_stream_draws_the_same_numbers_in_every_version():
     assert draws(Streams(3), "a", "pump 2") == [0.6653036503847838, 0.9648250980937277]
 
 
-def test_equal_stream_names_share_one_generator():
+def test_random_streams_with_equal_names_share_one_generator():
     for alike in [(3, 3.0, np.int64(3)), (1, True), (2.5, np.float32(2.5)), ("a", np.str_("a"))]:
         assert len({*draws(Streams(3), alike[0])} | {draws(Streams(3), n)[0] for n in alike}) == 1
 
@@ -228,19 +228,19 @@ def test_equal_stream_names_share_one_generator():
 @pytest.mark.parametrize(
     "name", [object(), Entity(1), Entity(1).method, ("pump", Entity(1)), lambda: 0, math.nan]
 )
-def test_names_that_no_other_process_finds_are_refused(name):
+def test_random_streams_refuse_names_that_differ_between_processes(name):
     with pytest.raises(OptionValueError, match=r'or a tuple of these, such as \("pump", 2\)'):
         Streams(3)[name]
 
 
 @pytest.mark.parametrize("name", [[1], ("pump", [1]), {}])
-def test_names_without_a_hash_are_refused(name):
+def test_random_streams_refuse_unhashable_names(name):
     with pytest.raises(TypeError, match="unhashable type"):
         Streams(3)[name]
 
 
 @pytest.mark.parametrize("reseed", [Streams.reseed, reseed_generators])
-def test_reseed_changes_existing_streams_in_place_and_later_ones(reseed):
+def test_reseeding_changes_existing_and_later_random_streams(reseed):
     def future(seed, used):
         streams = Streams(3)
         held = streams["a"]
@@ -253,7 +253,7 @@ def test_reseed_changes_existing_streams_in_place_and_later_ones(reseed):
     assert not {*future(1, 0), *future(3, 0)} & {*future(2, 0), *draws(Streams(3), "a", "later")}
 
 
-def test_entities_that_hold_their_streams_are_reseeded_with_them():
+def test_reseeding_reaches_random_streams_that_entities_hold():
     model = SimpleNamespace(streams=Streams(3))
     model.entities = [SimpleNamespace(chance=model.streams[name]) for name in "ab"]
     assert reseed_generators(model, 5) == 1
@@ -263,7 +263,7 @@ def test_entities_that_hold_their_streams_are_reseeded_with_them():
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))]
 )
-def test_copied_streams_continue_independently_from_the_same_state(duplicate):
+def test_copied_random_streams_continue_independently_from_the_same_state(duplicate):
     streams = Streams(3)
     streams["a"].random()
     twin = duplicate(streams)

@@ -72,7 +72,7 @@ def assert_alike(one, other):
     ],
     ids=str,
 )
-def test_observations_are_cast_to_their_space(space, value, expected):
+def test_env_observations_are_cast_to_their_space(space, value, expected):
     assert_alike(observation_cast(space)(value), expected)
 
 
@@ -110,7 +110,7 @@ def test_observations_are_cast_to_their_space(space, value, expected):
     ],
     ids=str,
 )
-def test_invalid_observations_are_refused(space, value, match):
+def test_observation_cast_refuses_invalid_observations(space, value, match):
     with pytest.raises(ObservationError, match=match):
         observation_cast(space)(value)
 
@@ -137,7 +137,7 @@ def leaves(value):
     ],
     ids=["box", "integers", "tuple", "dict", "list"],
 )
-def test_casts_and_duplicates_share_no_memory_with_the_original(made_of, value):
+def test_observation_cast_and_copy_share_no_memory_with_the_original(made_of, value):
     kept = copy.deepcopy(value)
     found = made_of(value)
     assert_alike(found, value)
@@ -147,7 +147,7 @@ def test_casts_and_duplicates_share_no_memory_with_the_original(made_of, value):
     assert not same(found, kept)
 
 
-def test_same_compares_arrays_dicts_and_tuples_by_value():
+def test_observation_comparison_compares_arrays_dicts_and_tuples_by_value():
     """Each of these is the same as its copy alone."""
     arrays = [
         np.array(numbers) for numbers in ([1.0, np.nan], [1.0, 2.0], [1.0, 4.0], [1.0, 2.0, 5.0])
@@ -162,7 +162,7 @@ def test_same_compares_arrays_dicts_and_tuples_by_value():
     assert [same((1, 2), 3), same(3, 4), same("word", "word")] == [False, False, True]
 
 
-def test_the_blank_of_a_space_without_a_zero_is_always_the_same():
+def test_blank_observation_of_a_space_without_zero_is_always_the_same():
     found = blank(WORDS)
     WORDS.seed(3)
     state = WORDS.np_random.bit_generator.state
@@ -195,14 +195,14 @@ class Choking(spaces.Space):
     ],
     ids=lambda given: type(given).__name__,
 )
-def test_actions_outside_the_space_are_illegal(space, actions):
+def test_action_check_refuses_actions_outside_the_space(space, actions):
     check = action_check(space)
     assert [action for action in actions if check(action) is not ILLEGAL] == []
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("number", [1, 2, 40])
-def test_each_element_of_a_box_is_checked_and_bounds_are_legal(number, dtype):
+def test_action_check_of_a_box_checks_each_element_and_accepts_the_bounds(number, dtype):
     high = np.full(number, 0.1, dtype)
     check = action_check(spaces.Box(-high, high, dtype=dtype))
     for legal in (
@@ -223,7 +223,7 @@ def test_each_element_of_a_box_is_checked_and_bounds_are_legal(number, dtype):
 
 
 @pytest.mark.parametrize("shape", [(1,), (2,)])
-def test_integers_are_clipped_without_wrapping_around(shape):
+def test_action_clipping_of_integers_does_not_wrap_around(shape):
     check = action_check(spaces.Box(-5, 2**63 - 1, shape, np.int64), clips=True)
     for given, clipped in (
         (np.uint64(2**64 - 1), 2**63 - 1),
@@ -235,12 +235,12 @@ def test_integers_are_clipped_without_wrapping_around(shape):
 
 @pytest.mark.parametrize("shape", [(), (1,)])
 @pytest.mark.parametrize(("given", "clipped"), [(5, 3), (np.int64(-5), 0), (np.array(2), 2)])
-def test_a_single_integer_is_clipped(shape, given, clipped):
+def test_action_clipping_works_for_a_single_integer(shape, given, clipped):
     check = action_check(spaces.Box(0, 3, shape, np.int64), clips=True)
     assert check(given) == clipped
 
 
-def test_parts_of_actions_are_checked_like_actions():
+def test_action_check_converts_each_part_of_a_dict_or_tuple_action():
     given = {"pair": [np.int8(6), {"bits": np.array([1, 0, 1], np.int8)}], "box": [0.5, 1]}
     found = action_check(TREE)(given)
     assert_alike(found, {"box": np.float32([0.5, 1]), "pair": (6, {"bits": np.int8([1, 0, 1])})})
@@ -260,7 +260,7 @@ def test_parts_of_actions_are_checked_like_actions():
     ids=str,
 )
 @pytest.mark.parametrize("clips", [False, True])
-def test_an_action_with_an_illegal_part_is_illegal(change, clips):
+def test_action_check_refuses_an_action_with_an_illegal_part(change, clips):
     action = {"pair": (6, {"bits": np.zeros(3, np.int8)}), "box": [0.5, 1]}
     check = action_check(TREE, clips=clips)
     assert check(action) is not ILLEGAL
@@ -290,7 +290,7 @@ def test_an_action_with_an_illegal_part_is_illegal(change, clips):
     ids=str,
 )
 @pytest.mark.parametrize("clips", [False, True])
-def test_items_of_actions_are_checked_like_actions(space, action, expected, clips):
+def test_action_check_converts_each_item_of_a_sequence_action(space, action, expected, clips):
     assert_alike(action_check(space, clips=clips)(action), expected)
 
 
@@ -308,7 +308,7 @@ def test_items_of_actions_are_checked_like_actions(space, action, expected, clip
     ],
     ids=str,
 )
-def test_refused_actions_name_the_illegal_element(space, action, match):
+def test_action_check_error_names_the_illegal_element(space, action, match):
     assert action_check(space)(action) is ILLEGAL
     with pytest.raises(InvalidActionError, match=match):
         action_check(space, raises=True)(action)
@@ -335,7 +335,7 @@ def test_refused_actions_name_the_illegal_element(space, action, match):
     ],
     ids=str,
 )
-def test_samples_are_legal_actions_and_observations(space):
+def test_samples_of_every_space_are_legal_actions_and_observations(space):
     space.seed(1)
     for _ in range(20):
         sample = space.sample()
@@ -346,7 +346,7 @@ def test_samples_are_legal_actions_and_observations(space):
     assert observation_cast(space)(blank(space)) in space
 
 
-def test_action_check_uses_contains_of_other_spaces_and_copies():
+def test_action_check_of_other_spaces_uses_contains_and_copies_the_action():
     given = np.array([1, 6])
     found = action_check(DIALS)(given)
     assert_alike(found, given)
@@ -360,7 +360,7 @@ def test_action_check_uses_contains_of_other_spaces_and_copies():
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def test_mask_cast_returns_a_new_int8_array():
+def test_action_mask_cast_returns_a_new_int8_array():
     column = np.int8([[1, 9], [0, 9], [1, 9]])[:, 0]
     for given in ([1, 0, 1], np.array([1.0, 0.0, 1.0]), column, np.array([True, False, True])):
         found = mask_cast(DIAL)(given)
@@ -381,7 +381,7 @@ def test_mask_cast_returns_a_new_int8_array():
     ],
     ids=repr,
 )
-def test_invalid_masks_are_refused(given, match):
+def test_action_mask_cast_refuses_invalid_masks(given, match):
     for space, mask in ((DIAL, given), (DIALS, ([1, 1], given))):
         with pytest.raises(MaskError, match=match):
             mask_cast(space)(mask)
@@ -390,6 +390,6 @@ def test_invalid_masks_are_refused(given, match):
 @pytest.mark.parametrize(
     "given", [([1, 1],), ([1, 1], [1, 1, 1], [1]), np.ones((2, 3)), None], ids=str
 )
-def test_masks_of_several_numbers_have_a_part_for_each(given):
+def test_action_mask_of_a_multi_discrete_space_needs_a_part_per_number(given):
     with pytest.raises(MaskError, match="2 parts"):
         mask_cast(DIALS)(given)

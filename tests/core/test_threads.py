@@ -52,7 +52,7 @@ def older_threads():
 
 
 @pytest.mark.parametrize("place", faults.PLACES)
-def test_a_simulation_has_one_thread_and_mappings_run_in_the_users(place, older_threads):
+def test_thread_driver_runs_the_model_in_its_own_thread_but_not_mappings(place, older_threads):
     env, farm = faults.farm_env(aec_env, place, driver="thread")
     (own,) = set(simulation_threads()) - set(older_threads)
     seen = set()
@@ -72,7 +72,7 @@ def test_a_simulation_has_one_thread_and_mappings_run_in_the_users(place, older_
 
 
 @EVERY_VIEW
-def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_threads):
+def test_thread_driver_env_can_be_used_from_a_new_thread_each_time(view, older_threads):
     decide = decision(agent="a_0")
     env = view(calling(*[decide] * 3), decide, driver="thread")
     for _ in range(2):
@@ -98,7 +98,7 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_thre
 @EVERY_VIEW
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
 @pytest.mark.parametrize("place", ["rule", "observation", "render"])
-def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, place):
+def test_thread_driver_env_refuses_two_threads_at_once_and_stays_unchanged(view, what, place):
     inside, go_on = threading.Event(), threading.Event()
 
     def wait():
@@ -128,7 +128,7 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, pl
 # -- what is left behind --------------------------------------------------------------------------
 
 
-def test_too_many_threads_are_an_error(monkeypatch, older_threads):
+def test_thread_driver_raises_an_error_if_no_thread_can_be_started(monkeypatch, older_threads):
     def refuse(*args, **kwargs):
         raise RuntimeError("can't start new thread")
 
@@ -162,7 +162,7 @@ def interrupt():
 
 @needs_signals
 @pytest.mark.parametrize("stops", [True, False])
-def test_an_interrupted_wait_ends_the_episode_and_its_simulation(stops, monkeypatch, older_threads):
+def test_thread_driver_keyboard_interrupt_ends_the_episode(stops, monkeypatch, older_threads):
     if not stops:
         monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log, decide = threading.Event(), [], decision()
@@ -199,7 +199,7 @@ def test_an_interrupted_wait_ends_the_episode_and_its_simulation(stops, monkeypa
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
-def test_a_simulation_that_does_not_unwind_is_given_up_with_a_warning(
+def test_thread_driver_warns_and_gives_up_a_model_that_does_not_unwind(
     monkeypatch, how, older_threads
 ):
     monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
@@ -221,7 +221,7 @@ def test_a_simulation_that_does_not_unwind_is_given_up_with_a_warning(
     stuck.join(10)
 
 
-def test_an_error_before_the_first_job_of_a_thread_reaches_its_caller(monkeypatch):
+def test_thread_driver_raises_errors_of_a_threads_start_to_its_caller(monkeypatch):
     def fail():
         raise MemoryError("no room for the stack")
 

@@ -56,7 +56,7 @@ LARGE = Variant("large", Farm, parameters={"fields": 3, "price": 2}, points=POIN
 DEAR = replace(LARGE, name="dear", plugins=[(dearer, HARVEST, "after")], policies={HARVEST: RULE})
 
 
-def test_a_variant_is_accepted_like_a_simulation():
+def test_envs_accept_a_variant_like_a_simulation():
     assert simulate(LARGE).log == [("wheat", 2)] * 3
     assert simulate(DEAR).log == [("wheat", 20)] * 3
     assert simulate(DEAR, {"sower_0": five}).log == [(5, 20)] * 3
@@ -73,7 +73,7 @@ def test_a_variant_is_accepted_like_a_simulation():
     assert Farm().sow(0) == "wheat"  # and the model is what it was
 
 
-def test_arguments_override_or_extend_the_fields_of_a_variant():
+def test_env_arguments_override_or_extend_the_fields_of_a_variant():
     assert simulate(DEAR, {HARVEST: five}).log == [("wheat", 50)] * 3
     assert simulate(DEAR, plugins=[(dearer, HARVEST, "after")]).log == [("wheat", 200)] * 3
     limited = replace(DEAR, options={"max_steps": 1})
@@ -83,7 +83,7 @@ def test_arguments_override_or_extend_the_fields_of_a_variant():
     assert len(play(aec_env(limited, max_steps=2), 1)) == 3
 
 
-def test_variants_are_frozen_and_can_be_pickled():
+def test_variant_is_frozen_and_can_be_pickled():
     with pytest.raises(FrozenInstanceError):
         LARGE.name = "larger"
     given = {"fields": 1}
@@ -126,12 +126,12 @@ def test_variants_are_frozen_and_can_be_pickled():
         ({"plugins": [(dearer, HARVEST, "between")]}, HandlerError, "between"),
     ],
 )
-def test_invalid_variants_are_refused(changes, error, message):
+def test_variant_refuses_invalid_fields(changes, error, message):
     with pytest.raises(error, match=message):
         aec_env(replace(LARGE, **changes))
 
 
-def test_provenance_lists_the_parts_of_an_environment():
+def test_env_provenance_lists_the_parts_of_an_env():
     env = aec_env(DEAR, max_steps=np.int64(9), policies={HARVEST: five})
     assert env.provenance()["seed"] is None
     env.reset(seed=3)
@@ -154,7 +154,7 @@ def test_provenance_lists_the_parts_of_an_environment():
     assert provenance(DEAR, seed=3, max_steps=9, policies={HARVEST: five}) == said
 
 
-def test_provenance_has_the_versions_of_the_models_packages():
+def test_env_provenance_has_the_versions_of_the_models_packages():
     move, untold = (
         "mesa.examples.advanced.wolf_sheep.agents.Wolf.move",
         "typing_extensions.reveal_type",
@@ -166,7 +166,7 @@ def test_provenance_has_the_versions_of_the_models_packages():
     assert said["variant"] is None
 
 
-def test_provenance_writes_values_that_are_no_json_as_text():
+def test_env_provenance_writes_values_that_are_no_json_as_text():
     ant = decision(agent="ant_0")
     parameters = {
         "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},

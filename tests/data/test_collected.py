@@ -103,7 +103,9 @@ def check(found, episodes, chosen):
 
 @given(colony_designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
 @examples(60)
-def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
+def test_collect_episodes_matches_aec_env_with_births_and_deaths(
+    design, seeds, size, announcing, most
+):
     def policy(observation, info):
         number = int(observation.sum()) % 6
         return RULE if number == 5 else number
@@ -128,7 +130,7 @@ def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, 
 
 @given(world_designs(), some_seeds, sizes)
 @examples(80)
-def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
+def test_collect_episodes_matches_aec_env_in_random_models(design, seeds, size):
     def simulation():
         return World(design, points)
 
@@ -151,7 +153,7 @@ def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
             )
 
 
-def test_agents_are_collected_under_their_own_keys():
+def test_collect_episodes_keeps_each_agents_data_under_its_key():
     points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
     policies = {
         Being.act: ones,
@@ -169,7 +171,7 @@ def test_agents_are_collected_under_their_own_keys():
         assert own.observations[:, 0].tolist() == [number] * len(own)
 
 
-def test_arrays_have_the_documented_shapes_and_dtypes():
+def test_collect_episodes_arrays_have_the_documented_shapes_and_dtypes():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Box(0, 9, (2, 3), np.float32),
@@ -198,7 +200,7 @@ def test_arrays_have_the_documented_shapes_and_dtypes():
     assert "6 decisions" in repr(found)
 
 
-def test_observations_actions_and_masks_of_several_parts_are_stacked():
+def test_collect_episodes_stacks_composite_observations_and_actions():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Dict(
@@ -229,7 +231,7 @@ def test_observations_actions_and_masks_of_several_parts_are_stacked():
     assert of_bee.actions.tolist() == [[1, 0]] * 2
 
 
-def test_policies_get_identities_of_decisions_and_may_return_extras():
+def test_collect_episodes_policies_get_decision_ids_and_can_return_extras():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     buffer = np.zeros((3, 2), np.float32)
 
@@ -259,7 +261,7 @@ def test_policies_get_identities_of_decisions_and_may_return_extras():
     ("second", "match"),
     [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")],
 )
-def test_extras_that_do_not_fit_are_refused(second, match):
+def test_collect_episodes_refuses_extras_of_a_wrong_length(second, match):
     ant = decision(agent="ant_0")
     answers = iter(
         [([1, 1], {"values": [0.5, 1.5]}), [1, 1] if second is None else ([1, 1], second)]
@@ -270,7 +272,7 @@ def test_extras_that_do_not_fit_are_refused(second, match):
         )
 
 
-def test_agents_that_never_decide_have_empty_arrays_and_their_spaces():
+def test_collect_episodes_returns_empty_arrays_of_agents_that_never_decide():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
     source = script(lambda simulation: bee() if simulation.seed % 2 else None)
     found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
@@ -292,7 +294,7 @@ def test_agents_that_never_decide_have_empty_arrays_and_their_spaces():
     assert unborn["being_3"].action_space is None
 
 
-def test_collect_is_called_with_each_simulation():
+def test_collect_function_is_called_with_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def found(policies, **options):
@@ -317,7 +319,7 @@ def test_collect_is_called_with_each_simulation():
             found(policies)
 
 
-def test_one_name_at_points_whose_spaces_differ_is_refused():
+def test_collect_episodes_refuses_one_agent_name_with_different_spaces():
     space = {"observation_space": spaces.Discrete(3), "observation_space_mapping": lambda other: 1}
     points = beings() | others(agent=lambda other: f"being_{other.number}", **space)
     source = script(lambda simulation: (Being if simulation.seed else Other)(0).act() and None)
@@ -325,7 +327,7 @@ def test_one_name_at_points_whose_spaces_differ_is_refused():
         collect_episodes(source, {"being_0": ones}, points=points, seeds=range(2))
 
 
-def test_points_without_a_policy_of_the_call_are_no_agents():
+def test_collect_episodes_returns_only_agents_whose_policies_are_given():
     asked = []
     ant, bee = (
         decision(agent="ant_0"),

@@ -28,7 +28,7 @@ def twos(observations):
     return [2] * len(observations)
 
 
-def test_mixtures_leave_each_decision_to_one_of_their_policies():
+def test_mixture_leaves_each_decision_to_one_of_its_policies():
     ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 3)
     mixture = Mixture({ones: 3, twos: 1, RULE: 4})
     assert repr(mixture) == "<Mixture: 0.375 ones, 0.125 twos, 0.5 rule>"
@@ -50,7 +50,7 @@ def test_mixtures_leave_each_decision_to_one_of_their_policies():
     ]
 
 
-def test_mixtures_draw_by_seed_and_decision_alone():
+def test_mixture_choice_depends_only_on_the_seed_and_the_decision():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     mixture = Mixture(iter([(ones, 0.5), (twos, 0.5)]))
 
@@ -81,7 +81,7 @@ def test_mixtures_draw_by_seed_and_decision_alone():
     ]  # by SplitMix64, in any version
 
 
-def test_mixtures_pass_each_component_its_own_rows():
+def test_mixture_passes_each_policy_its_own_observations():
     seen, mask = [], [0, 1, 1] + [0] * 7
 
     def informed(observations, infos, identities):
@@ -100,7 +100,7 @@ def test_mixtures_pass_each_component_its_own_rows():
     assert own.extras.keys() == {"component"}
 
 
-def test_mixtures_work_with_composite_spaces():
+def test_mixture_works_with_composite_spaces():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), what=spaces.Discrete(3))
     observed = {
         "observation_space": space,
@@ -126,12 +126,12 @@ def test_mixtures_work_with_composite_spaces():
     ],
     ids=plainly,
 )
-def test_invalid_mixtures_are_refused(parts):
+def test_mixture_refuses_invalid_arguments(parts):
     with pytest.raises(OptionValueError, match=r"mixture|weight"):
         Mixture(parts)
 
 
-def test_data_sets_need_minari_and_one_name_for_each_policy(monkeypatch):
+def test_record_dataset_needs_minari_and_one_name_for_each_policy(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
     monkeypatch.setitem(sys.modules, "minari", None)
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
@@ -155,7 +155,7 @@ def test_data_sets_need_minari_and_one_name_for_each_policy(monkeypatch):
         record_dataset("ants-v0", calling(ant, bee), {ant: ones}, **given)
 
 
-def test_unknown_rule_actions_are_refused_before_anything_runs(monkeypatch):
+def test_record_dataset_refuses_unknown_rule_actions_before_it_runs(monkeypatch):
     monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
 
     class Ran(Exception):
@@ -191,7 +191,7 @@ def crowd(simulation):
 
 
 @pytest.mark.parametrize("size", [1, 8])
-def test_policies_are_asked_while_the_rule_decides(size):
+def test_compare_with_rule_asks_policies_but_executes_the_models_rule(size):
     given = {"points": TOLD, "seeds": [1, 2], "batch_size": size}
     found = compare_with_rule(script(crowd), {Being.act: ones}, **given)[Being.act]
     alone = collect_episodes(script(crowd), {Being.act: RULE}, **given)[Being.act]
@@ -214,7 +214,7 @@ def test_policies_are_asked_while_the_rule_decides(size):
         assert np.array_equal(getattr(found.trajectories, name), getattr(alone, name)), name
 
 
-def test_policy_that_answers_rule_counts_as_agreeing_with_the_rule():
+def test_compare_with_rule_counts_a_policys_rule_answer_as_agreement():
     policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
     found = compare_with_rule(script(crowd), {Being.act: policy}, points=TOLD, seeds=range(4))[
         Being.act
@@ -223,7 +223,7 @@ def test_policy_that_answers_rule_counts_as_agreeing_with_the_rule():
     assert found.agreements.tolist() == (found.policy_actions != 7).tolist()
 
 
-def test_numbers_may_differ_by_a_tolerance():
+def test_compare_with_rule_accepts_numbers_within_a_tolerance():
     space = spaces.Dict(how=spaces.Box(-9, 9, (2,), np.float32), what=spaces.Discrete(3))
     answers = [
         {"how": np.array(how, np.float32), "what": what}
@@ -239,7 +239,7 @@ def test_numbers_may_differ_by_a_tolerance():
         assert found[ant].agreements.tolist() == [True] * number + [False] * (4 - number)
 
 
-def test_actions_of_all_kinds_are_compared():
+def test_compare_with_rule_compares_actions_of_all_spaces():
     space = spaces.Tuple(
         [spaces.MultiDiscrete([3, 3]), spaces.Text(5), spaces.Dict(a=spaces.MultiBinary(2))]
     )
@@ -258,7 +258,7 @@ def test_actions_of_all_kinds_are_compared():
     assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
 
 
-def test_comparisons_of_several_policies_and_without_decisions():
+def test_compare_with_rule_takes_several_policies_even_if_one_never_decides():
     ant, bee = (
         decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0")
     )
@@ -273,7 +273,7 @@ def test_comparisons_of_several_policies_and_without_decisions():
     assert np.isnan(found[bee].agreement)
 
 
-def test_decisions_that_correspond_to_no_action():
+def test_compare_with_rule_refuses_rule_decisions_without_an_action():
     points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
     with pytest.raises(
         DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"
@@ -295,7 +295,7 @@ def test_decisions_that_correspond_to_no_action():
     ],
     ids=plainly,
 )
-def test_invalid_comparisons_are_refused(wrong):
+def test_compare_with_rule_refuses_invalid_arguments(wrong):
     ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)
     given = {"policies": {ant: ones}, "seeds": [1], **wrong}
     with pytest.raises(OptionValueError, match=next(iter(wrong))):

@@ -91,7 +91,7 @@ def played(env, answer, seed):
     return env.unwrapped.simulation.trace
 
 
-def test_a_turn_policy_decides_as_in_its_environment():
+def test_turn_policy_decides_in_simulate_as_in_turn_env():
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     expected = [played(env, predict, seed) for seed in SEEDS]
     policies = turn_policy(predict, like=env)
@@ -106,7 +106,7 @@ def test_a_turn_policy_decides_as_in_its_environment():
     assert simulate(Bakery, again, points=POINTS, seed=2).trace == expected[2]
 
 
-def test_a_batched_turn_policy_gets_stacks():
+def test_turn_policy_with_batches_gets_stacked_observations():
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER, flatten=True)
     expected = [played(env, predict, seed) for seed in SEEDS]
     sizes = []
@@ -125,7 +125,7 @@ def test_a_batched_turn_policy_gets_stacks():
     assert max(sizes) > 1
 
 
-def test_multidiscrete_masks_reach_turn_policies():
+def test_turn_policy_gets_masks_of_multi_discrete_actions():
     several = {
         "agent": lambda: "ant_0",
         "action_space": spaces.MultiDiscrete([2, 3]),
@@ -147,7 +147,7 @@ def test_multidiscrete_masks_reach_turn_policies():
         assert found.log == [[1, 2]]
 
 
-def test_a_joint_policy_decides_in_rounds_as_in_its_environment():
+def test_joint_policy_decides_in_simulate_as_in_joint_env():
     for flatten in (False, True):
         env = joint_env(Bakery, POINTS, possible_agents=ROSTER, flatten=flatten)
 
@@ -166,7 +166,7 @@ def test_a_joint_policy_decides_in_rounds_as_in_its_environment():
         assert traces == expected
 
 
-def test_evaluations_and_collections_take_a_policy_for_all():
+def test_evaluate_and_collect_episodes_take_a_turn_or_joint_policy():
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     joint = joint_env(Bakery, POINTS, possible_agents=ROSTER)
 
@@ -194,7 +194,7 @@ def test_evaluations_and_collections_take_a_policy_for_all():
     assert names == {"bake": {"oven_0", "oven_1"}, "sell": {"shop"}}
 
 
-def test_turn_policy_can_answer_for_all_but_one_agent():
+def test_turn_policy_can_decide_for_all_other_agents_of_single_env():
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     expected = played(env, predict, 1)
     policies = turn_policy(predict, like=env)
@@ -213,7 +213,7 @@ def test_turn_policy_can_answer_for_all_but_one_agent():
         turn_env(Bakery, POINTS, policies=policies)
 
 
-def test_turn_and_joint_policies_explain_their_refusals():
+def test_turn_and_joint_policies_refuse_wrong_use_with_an_explanation():
     ant = decision(agent="ant_0")
     env = turn_env(calling(ant), [ant])
     with pytest.raises(OptionValueError, match="SimulationJointEnv"):
@@ -233,7 +233,7 @@ def test_turn_and_joint_policies_explain_their_refusals():
     ).log == ["rule"]
 
 
-def test_the_teams_reward_counts_once_in_evaluations(tmp_path):
+def test_evaluate_counts_the_team_reward_once(tmp_path):
     env = turn_env(Bakery, POINTS, possible_agents=ROSTER)
     contenders = {"rule": {}, "turn": turn_policy(predict, like=env)}
     options = {"points": POINTS, "team_reward": difference(lambda bakery: bakery.heat)}
@@ -270,7 +270,7 @@ class Pair(SimulationInterface):
         return 0
 
 
-def test_a_joint_policy_sees_last_observations_of_ended_agents():
+def test_joint_policy_gets_the_last_observations_of_ended_agents():
     points = {
         f"{__name__}.Pair.act": define(
             agent=lambda pair, name: name,

@@ -93,7 +93,7 @@ def thirds(seen):
         (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>"),
     ],
 )
-def test_data_sets_hold_the_collected_episodes_and_the_policy_name(policy, name):
+def test_record_dataset_stores_episodes_and_the_policys_name(policy, name):
     points = beings(rule_action_mapping=lambda decided, being: being.health)
     given = {"points": points, "seeds": [3, 1, 5, 2**70]}
     recorded = record_dataset(NAME, script(herd), {Being.act: policy}, batch_size=2, **given)
@@ -118,7 +118,7 @@ SPACES = [
 
 
 @pytest.mark.parametrize("space", SPACES, ids=str)
-def test_minari_reads_all_kinds_of_spaces(space):
+def test_record_dataset_stores_all_spaces_so_that_minari_reads_them(space):
     space.seed(1)
     ant = decision(
         agent="ant_0",
@@ -131,7 +131,7 @@ def test_minari_reads_all_kinds_of_spaces(space):
     check(found, save_dataset(NAME, found))
 
 
-def test_data_set_infos_have_one_row_per_observation():
+def test_record_dataset_infos_have_one_row_per_observation():
     def main(simulation):
         simulation.log += [ant()]
         simulation.log += [ant()]
@@ -145,7 +145,7 @@ def test_data_set_infos_have_one_row_per_observation():
     assert episode.infos["values"].tolist() == [[0.5, 0.5]] * 2 + [[0, 0]]
 
 
-def test_each_policy_has_a_data_set():
+def test_record_dataset_makes_a_data_set_per_policy():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     policies = {"ant_0": ones, "bee_0": lambda seen: [2] * len(seen), ant: ones}
     names = {"ant_0": "simenv/ants-v0", "bee_0": "simenv/bees-v1"}
@@ -159,7 +159,7 @@ def test_each_policy_has_a_data_set():
     ] * 2
 
 
-def test_the_environment_can_be_recovered():
+def test_minari_recovers_the_environment_of_a_recorded_data_set():
     greenhouse = pytest.importorskip("examples.greenhouse_coop.env")
     policies, metadata = {"waterer_0": RULE}, {"env": "greenhouse_coop/Watering-v0"}
     record_dataset(
@@ -181,7 +181,7 @@ def test_the_environment_can_be_recovered():
     env.close()
 
 
-def test_record_dataset_overwrites_nothing_and_refuses_before_running():
+def test_record_dataset_refuses_existing_names_before_it_runs():
     def never(simulation):
         raise AssertionError
 
@@ -212,7 +212,7 @@ def test_record_dataset_overwrites_nothing_and_refuses_before_running():
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("number", [1, 2])
-def test_an_interrupt_leaves_no_name_taken(number, monkeypatch):
+def test_record_dataset_leaves_no_data_set_after_an_interrupt(number, monkeypatch):
     """Neither by half a data set, nor by the first of two."""
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     names = {ant: "simenv/ants-v0", bee: "simenv/bees-v0"}
@@ -233,14 +233,14 @@ def test_an_interrupt_leaves_no_name_taken(number, monkeypatch):
     assert not list(Path(os.environ["MINARI_DATASETS_PATH"]).rglob("*-v0"))
 
 
-def test_unknown_rule_actions_are_refused():
+def test_record_dataset_refuses_rule_decisions_without_an_action():
     points = beings(rule_action_mapping=lambda decided, being: None)
     with pytest.raises(DefinitionError, match="not known"):
         record_dataset(NAME, script(herd), {Being.act: lambda seen: RULE}, points=points, seeds=[1])
     assert not minari.list_local_datasets()
 
 
-def test_examples_of_the_demonstrations_page_run(monkeypatch):
+def test_examples_of_the_demonstrations_page_run_as_printed(monkeypatch):
     """With the examples that need Minari, which are skipped where it is not there."""
     page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
     monkeypatch.syspath_prepend(page.parent)

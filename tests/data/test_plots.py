@@ -86,7 +86,7 @@ def ticks(axes):
     return [label.get_text() for label in axes.get_yticklabels()]
 
 
-def test_timeline_shows_each_labelled_action_and_each_reward():
+def test_plot_timeline_shows_each_labelled_action_and_each_reward():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: 2.0)
     answers = {ant: iter([1, 2, 3]), bee: iter([7, 8])}
     policies = {key: lambda observations, own=own: [next(own)] for key, own in answers.items()}
@@ -116,7 +116,7 @@ def test_timeline_shows_each_labelled_action_and_each_reward():
         plot_timeline(found, action_names="dig")
 
 
-def test_timeline_has_the_simulation_time_on_the_x_axis():
+def test_plot_timeline_has_the_simulation_time_on_the_x_axis():
     def main(simulation):
         simulation.log.append(Being(0).act())  # whom the model has let go of lives to the end
         keeper = Being(1)
@@ -138,7 +138,7 @@ def test_timeline_has_the_simulation_time_on_the_x_axis():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_decisions_of_the_rule_look_different(known):
+def test_plot_timeline_draws_decisions_of_the_rule_differently(known):
     names = {**dict(enumerate("abcdefghi")), 9: "rule"} if known else int
     ant = decision(agent="ant_0", action_space_mapping=names)
     found = answered(ant, [1], RULE, [3])
@@ -151,7 +151,7 @@ def test_decisions_of_the_rule_look_different(known):
     assert dots(plot_timeline(found[ant]).axes[0]) == [by_policy, by_rule]
 
 
-def test_actions_of_several_parts_have_a_chart_for_each_part():
+def test_plot_timeline_has_a_chart_for_each_part_of_an_action():
     space = spaces.Dict(
         how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9)
     )
@@ -167,7 +167,7 @@ def test_actions_of_several_parts_have_a_chart_for_each_part():
     assert {"how[0]", "how[1]"} <= set(texts(by_name["how"]))
 
 
-def test_times_without_a_living_agent_are_shaded():
+def test_plot_timeline_shades_times_in_which_an_agent_is_not_alive():
     first, _, second, _, third, _ = plot_timeline(herd(3, 2, dying=[1])).axes
     # being_1, which has made the second of five decisions, goes after the third.
     assert [patch.get_x() for patch in second.patches] == [0, 3]
@@ -187,7 +187,7 @@ def drawn(axes):
     return sorted((cell.x0, cell.x1, (cell.y0 + cell.y1) / 2) for cell in cells)
 
 
-def test_many_agents_have_a_row_each_and_some_can_be_chosen():
+def test_plot_timeline_has_a_row_per_agent_and_some_can_be_chosen():
     found = herd(200, 3, dying=range(0, 200, 2))
     figure = plot_timeline(found)
     actions, rewards = figure.axes[:2]
@@ -217,7 +217,7 @@ def test_many_agents_have_a_row_each_and_some_can_be_chosen():
         plot_timeline(found, agents="being_7")
 
 
-def test_rows_are_coloured_by_the_action():
+def test_plot_timeline_colours_rows_by_the_action():
     found = herd(
         8, 1, key=f"{Being.__module__}.Being.act", policy=lambda seen: [3, *[0] * 7][: len(seen)]
     )
@@ -228,7 +228,7 @@ def test_rows_are_coloured_by_the_action():
     assert actions.get_title(loc="left") == "Being.act, 8 agents: action"
 
 
-def test_rows_of_actions_with_components_are_coloured_by_one():
+def test_plot_timeline_colours_rows_by_one_component_of_an_action():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), far=spaces.Discrete(5))
     answer = {"how": np.array([1, 2], np.float32), "far": 4}
     found = herd(8, 1, policy=lambda seen: [answer] * len(seen), action_space=space)
@@ -247,7 +247,7 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
         plot_timeline(found, component="where")
 
 
-def test_unknown_actions_of_the_rule_are_grey():
+def test_plot_timeline_draws_unknown_rule_actions_grey():
     answers = iter([RULE])
     found = herd(8, 1, policy=lambda seen: next(answers, [2] * len(seen)), seeds=(5, 6))
     assert found[Being.act].by_rule.any()
@@ -258,7 +258,7 @@ def test_unknown_actions_of_the_rule_are_grey():
     plot_timeline(herd(8, 2, policy=lambda seen: RULE)).canvas.draw()  # by nobody but the rule
 
 
-def test_numbers_and_too_many_different_actions_share_a_scale():
+def test_plot_timeline_uses_a_colour_scale_for_numbers_and_many_actions():
     policies = {f"being_{place}": lambda seen, own=place: [own] * len(seen) for place in range(30)}
     many = herd(30, 1, key=policies, action_space=spaces.Discrete(40))
     given = {
@@ -275,7 +275,7 @@ def test_numbers_and_too_many_different_actions_share_a_scale():
         assert scale.get_clim() == (0, most)
 
 
-def test_episode_index_counts_from_either_end_and_counts_empty_ones():
+def test_plot_timeline_episode_index_counts_from_either_end():
     ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
     main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
     found = collect_episodes(script(main), {ant: ones}, seeds=[0, 8, 9])
@@ -341,13 +341,13 @@ def rows_of(figure):
         ("team", {"": [6, 10, 26]}),
     ],
 )
-def test_a_point_is_the_mean_of_the_agents_or_of_one_or_the_sum(per, rows):
+def test_plot_returns_shows_the_mean_one_agent_or_the_sum(per, rows):
     found = rows_of(plot_returns(paid_by_seed(2), per=per))
     assert [values for _, values in found] == list(rows.values())
     assert dict(found) == rows or per == "team"
 
 
-def test_plotted_intervals_are_reproducible_and_teams_cover_all_policies():
+def test_plot_returns_intervals_are_reproducible_and_cover_the_team():
     intervals = [plot_returns(paid_by_seed(3)).axes[0].texts[0].get_text() for _ in range(2)]
     assert intervals == ["8  [-5.145, 21.14]"] * 2  # by Student's t
     ant, bee = (
@@ -358,7 +358,7 @@ def test_plotted_intervals_are_reproducible_and_teams_cover_all_policies():
     assert [values for _, values in rows_of(plot_returns(found, per="team"))] == [[12, 12]]
 
 
-def test_several_collections_stand_side_by_side():
+def test_plot_returns_shows_several_collections_side_by_side():
     several = {"once": paid_by_seed(3), "twice": paid_by_seed(3, 2.0)}
     figure = plot_returns(several)
     assert rows_of(figure) == [("once", [4, 6, 14]), ("twice", [6, 10, 26])]

@@ -27,12 +27,12 @@ def logs(pool, seeds, agents=("ant_0", "bee_0")):
     return [simulate(make, policies, points=points, seed=seed).log for seed in seeds]
 
 
-def test_one_policy_decides_for_all_agents_of_an_episode():
+def test_opponent_pool_uses_one_policy_for_all_agents_of_an_episode():
     found = logs(OpponentPool([always(1), always(2)]), range(20))
     assert {tuple(log) for log in found} == {(1,) * 6, (2,) * 6}
 
 
-def test_the_seed_of_the_episode_determines_the_draw():
+def test_opponent_pool_draw_depends_on_the_episodes_seed():
     pool = OpponentPool([always(1), always(2), RULE], seed=3)
     assert logs(pool, range(10)) == logs(pickle.loads(pickle.dumps(PICKLED)), range(10))
     assert logs(pool, range(10)) != logs(OpponentPool(pool.policies, seed=4), range(10))
@@ -49,14 +49,14 @@ def two(observation):
 PICKLED = OpponentPool([one, two, RULE], seed=3)
 
 
-def test_policies_are_drawn_by_their_weights():
+def test_opponent_pool_draws_policies_by_their_weights():
     pool = OpponentPool([always(1), always(2), always(3)], weights=[1, 0, 3])
     drawn = Counter(pool.draw(seed) for seed in range(2000))
     assert drawn[1] == 0
     assert drawn[2] / drawn[0] == pytest.approx(3, rel=0.2)
 
 
-def test_an_added_policy_is_drawn_from_the_next_episode_on():
+def test_opponent_pool_draws_an_added_policy_from_the_next_episode_on():
     points, make = ant_and_bee()
     pool = OpponentPool([RULE])
     env = single_env(make, points, policies={"bee_0": pool})
@@ -70,7 +70,7 @@ def test_an_added_policy_is_drawn_from_the_next_episode_on():
     assert env.unwrapped.simulation.log[:2] == [1, 7]
 
 
-def test_a_clone_goes_on_with_the_drawn_policy():
+def test_clone_continues_with_the_policy_drawn_from_an_opponent_pool():
     points, make = ant_and_bee()
     pool = OpponentPool([always(1)])
     env = single_env(make, points, policies={"bee_0": pool})
@@ -83,14 +83,14 @@ def test_a_clone_goes_on_with_the_drawn_policy():
     twin.close()
 
 
-def test_policies_of_a_pool_may_ask_for_the_decision():
+def test_opponent_pool_policies_can_take_the_decision():
     def numbered(observation, *, _decision):
         return _decision.number
 
     assert logs(OpponentPool([numbered]), [0], ["ant_0"])[0][::2] == [1, 2, 3]
 
 
-def test_a_pool_decides_in_many_simulations_and_evaluations():
+def test_opponent_pool_works_in_simulate_many_and_evaluate():
     points, make = ant_and_bee()
     pool = OpponentPool([always(1), always(2)])
     many = simulate_many(make, {"ant_0": pool}, points=points, seeds=range(6))
@@ -111,12 +111,12 @@ def test_a_pool_decides_in_many_simulations_and_evaluations():
     ],
     ids=["number", "planner", "state", "negative", "nan", "few", "seed"],
 )
-def test_a_pool_refuses_wrong_arguments(options, message):
+def test_opponent_pool_refuses_wrong_arguments(options, message):
     with pytest.raises(OptionValueError, match=message):
         OpponentPool(**options)
 
 
-def test_a_coroutine_is_refused_when_it_is_added():
+def test_opponent_pool_refuses_coroutine_policies():
     async def wait(observation):
         return 1
 
@@ -124,6 +124,6 @@ def test_a_coroutine_is_refused_when_it_is_added():
         OpponentPool([RULE]).add(wait)
 
 
-def test_a_pool_without_weights_is_an_error_at_the_draw():
+def test_opponent_pool_without_weights_raises_an_error_at_the_draw():
     with pytest.raises(OptionValueError, match="no policy with a weight above 0"):
         OpponentPool([RULE], weights=[0]).draw(1)

@@ -34,7 +34,7 @@ def begun(source, function, **options):
     ids=["callable", "dict", "none"],
 )
 @EVERY_DRIVER
-def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping, told):
+def test_info_has_the_rule_action_of_the_latest_decision_only(mapping, told):
     function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
     env = begun(calling(*[function] * 4), function)
     expected = [{} if action is None else {"rule_action": action} for action in told]
@@ -56,7 +56,7 @@ def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping,
     ],
     ids=["outside the space", "not in the dict", "raising"],
 )
-def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
+def test_rule_action_mapping_errors_cannot_be_caught_by_the_model(mapping, error, match, note):
     function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
 
     def main(simulation):
@@ -72,7 +72,7 @@ def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
     env.reset(seed=0)
 
 
-def test_decisions_within_rules_do_not_take_each_others_place():
+def test_info_rule_action_is_right_if_a_rule_makes_other_decisions():
     inner = decision(lambda: 2, agent="inner_0", rule_action_mapping=lambda decided: decided)
     outer = decision(
         lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // 5
@@ -87,7 +87,7 @@ def test_decisions_within_rules_do_not_take_each_others_place():
         play(aec_env(calling(wrong), [wrong, inner]), RULE, seed=0)
 
 
-def test_each_entity_gets_its_own_rule_action():
+def test_info_has_each_entitys_own_rule_action():
     points, names = (
         beings(rule_action_mapping=lambda decided, being: being.number),
         ["being_0", "being_1", "being_2"],
@@ -98,7 +98,7 @@ def test_each_entity_gets_its_own_rule_action():
     assert [infos[agent].get("rule_action") for agent in names] == [0, None, 2]
 
 
-def test_arrays_of_rule_actions_are_cast_and_copied():
+def test_info_rule_action_arrays_are_cast_and_copied():
     decided = np.array([0.25, 0.5])
     space = spaces.Box(0, 1, (2,), np.float32)
     function = decision(
@@ -128,7 +128,7 @@ def test_rule_action_mapping_beside_apply_runs_after_the_rule():
 
 
 @EVERY_DRIVER
-def test_generators_and_coroutines_have_rule_actions():
+def test_info_has_rule_actions_of_generators_and_coroutines():
     def slowly():
         yield "wait"
         return 3
@@ -189,7 +189,7 @@ MOVES = {0: "stay", 1: "north", 2: "south"}
     ],
     ids=["mapping", "nothing", "dict", "unhashable", "ambiguous", "lists", "choices"],
 )
-def test_episodes_that_were_collected_have_the_actions_of_the_rule(rule, definition, expected):
+def test_collect_episodes_returns_the_actions_of_the_rule(rule, definition, expected):
     if "choices" in definition:
         definition = {"choices": in_turn([*definition["choices"], ["a"]])}
     given = {"action_space": spaces.Discrete(3)} if "rule_action_mapping" not in definition else {}

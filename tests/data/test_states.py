@@ -80,7 +80,7 @@ def checking_one(observation, info, *, _state):
 
 @given(yard_designs, st.lists(seeds, max_size=4), st.integers(1, 4), st.none() | st.integers(1, 12))
 @examples(40)
-def test_trajectories_have_the_states_at_decisions_and_ends(design, several, size, most):
+def test_collect_episodes_returns_states_at_decisions_and_ends(design, several, size, most):
     found = collect_episodes(
         lambda: Yard(design),
         everywhere(by_row(yard_policy)),
@@ -105,7 +105,7 @@ def test_trajectories_have_the_states_at_decisions_and_ends(design, several, siz
 
 @given(yard_designs, st.lists(seeds, max_size=3), st.sampled_from(["all", "machines", "names"]))
 @examples(20)
-def test_states_of_observations_match_an_aec_environment(design, several, whose):
+def test_collect_episodes_states_of_observations_match_aec_env(design, several, whose):
     options = {
         "points": YARD_POINTS,
         "max_steps": 12,
@@ -143,7 +143,7 @@ def test_states_of_observations_match_an_aec_environment(design, several, whose)
             assert state.tolist() == expected[key].tolist()
 
 
-def test_state_is_not_called_where_no_result_or_policy_uses_it():
+def test_simulation_state_is_not_called_if_nothing_uses_it():
     class Silent(Yard):
         def state(self):
             raise AssertionError
@@ -156,7 +156,7 @@ def test_state_is_not_called_where_no_result_or_policy_uses_it():
     evaluate(lambda: Silent(BUSY), {"a": policies}, batched=True, state_space=SPACE, **given)
 
 
-def test_workers_find_the_same_states():
+def test_collect_episodes_with_workers_returns_the_same_states():
     policies = {PLANS: RULE, f"{HERE}.Machine.load": checking, f"{HERE}.Machine.pace": checking}
     alone, one, two = (
         collect_episodes(
@@ -179,7 +179,7 @@ def test_workers_find_the_same_states():
     assert many[0] == many[1]
 
 
-def test_states_of_ends_are_recorded_with_plugins_and_either_driver():
+def test_collect_episodes_records_last_states_with_plugins_and_each_driver():
     attach_handler(lambda state: state, f"{HERE}.Yard.plan", "after")
     try:
         for driver in ("greenlet", "thread"):
@@ -199,7 +199,7 @@ def test_states_of_ends_are_recorded_with_plugins_and_either_driver():
         remove_handler(f"{HERE}.Yard.plan", "after")
 
 
-def test_data_sets_contain_states(tmp_path, monkeypatch):
+def test_record_dataset_contains_states(tmp_path, monkeypatch):
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     policies = {"planner": by_row(lambda observation: 2)}
@@ -222,7 +222,7 @@ def traces(policies, **options):
     )
 
 
-def test_batched_policies_get_stacked_states():
+def test_batched_policies_get_stacked_simulation_states():
     expected = traces(everywhere(by_row(yard_policy)))
 
     def third(observations, infos, identities, *, _state):
@@ -247,7 +247,7 @@ def test_batched_policies_get_stacked_states():
     assert values["states"].tolist() == values["plain"].tolist()
 
 
-def test_policies_that_answer_one_decision_get_its_state():
+def test_policies_get_the_simulation_state_of_their_decision():
     async def waiting(observation, info, *, _state):
         await asyncio.sleep(0)
         return checking_one(observation, info, _state=_state)
@@ -283,7 +283,7 @@ def test_policies_that_answer_one_decision_get_its_state():
     assert values["states"].tolist() == values["plain"].tolist()
 
 
-def test_policies_get_the_states_of_branches():
+def test_policies_in_branches_get_the_simulation_state_of_their_branch():
     seen = []
 
     def trying(observation, *, _environment):
@@ -300,7 +300,7 @@ def test_policies_get_the_states_of_branches():
     assert len(seen) > 5
 
 
-def test_mixtures_and_comparisons_pass_states_on():
+def test_mixture_and_compare_with_rule_pass_simulation_states_to_policies():
     def two(observations, *, _state):
         assert _state[:, 0].tolist() == observations[:, 2].tolist()
         return np.full(len(observations), 2)
@@ -323,7 +323,7 @@ def test_mixtures_and_comparisons_pass_states_on():
     assert not Mixture({by_row(yard_policy): 1}).takes_state
 
 
-def test_deployed_policies_get_states():
+def test_turn_and_joint_policies_get_the_simulation_state():
     env = turn_env(busy, YARD_POINTS)
 
     def one(observation, info, *, _state):
@@ -361,7 +361,7 @@ def test_deployed_policies_get_states():
 # -- refusals -------------------------------------------------------------------------------------
 
 
-def test_states_of_observations_need_known_agents():
+def test_collect_episodes_states_of_observations_need_possible_agents():
     policies = everywhere(by_row(yard_policy))
     given = {"points": YARD_POINTS, "seeds": range(2), "state_space": "observations"}
     with pytest.raises(OptionValueError, match="possible_agents="):
@@ -377,7 +377,7 @@ def test_states_of_observations_need_known_agents():
     assert collect_episodes(busy, policies, **given, possible_agents=YARD_ROSTER)
 
 
-def test_states_that_cannot_be_stacked_are_refused():
+def test_collect_episodes_refuses_states_that_cannot_be_stacked():
     class Growing(Yard):
         def state(self):
             return self.trace and [0.0] * (1 + len(self.trace))

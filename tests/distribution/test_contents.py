@@ -32,14 +32,14 @@ def wheel():
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def test_the_source_distribution_contains_the_repository(tracked):
+def test_source_distribution_contains_the_repository(tracked):
     (path,) = (ROOT / "dist").glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert names == tracked | {"PKG-INFO"}
 
 
-def test_the_wheel_contains_the_package_and_nothing_else(tracked, wheel):
+def test_wheel_contains_the_package_and_nothing_else(tracked, wheel):
     package = {path.removeprefix("src/") for path in tracked if path.startswith("src/simenv_marl/")}
     assert "simenv_marl/py.typed" in package
     described = f"simenv_marl-{simenv_marl.__version__}.dist-info/"
@@ -49,7 +49,7 @@ def test_the_wheel_contains_the_package_and_nothing_else(tracked, wheel):
     assert wheel[f"{described}licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()
 
 
-def test_the_tests_use_the_installed_package(wheel):
+def test_distribution_tests_use_the_installed_package(wheel):
     package = Path(simenv_marl.__file__).parent
     assert package.parent.name == "site-packages"
     for name, content in wheel.items():

@@ -22,7 +22,7 @@ VIEWS = {
 }
 MAKERS = VIEWS | {
     "generated": partial(WalkEnv, max_steps=2),
-    "of no name": lambda: generate_env(Walk, Walk.choose, view="aec")(max_steps=2),
+    "generated without a name": lambda: generate_env(Walk, Walk.choose, view="aec")(max_steps=2),
 }
 COPIES = pytest.mark.parametrize(
     "copied",
@@ -57,12 +57,14 @@ def episode(env, **reset):
 
 @pytest.mark.parametrize("name", MAKERS)
 @COPIES
-def test_copy_of_an_environment_gives_the_episodes_of_the_original(name, copied):
+def test_copied_env_gives_the_same_episodes_as_the_original(name, copied):
     """Before the first episode, after it, and when it was closed; its generators come along."""
     env = MAKERS[name]()
     for number in range(3):
         twin = copied(env)
-        assert isinstance(twin, SimulationAECEnv if name == "of no name" else type(env))
+        assert isinstance(
+            twin, SimulationAECEnv if name == "generated without a name" else type(env)
+        )
         assert twin.simulation is not env.simulation
         seed = {} if number else {"seed": 5}
         assert episode(twin, **seed) == episode(env, **seed)
@@ -74,7 +76,7 @@ def test_copy_of_an_environment_gives_the_episodes_of_the_original(name, copied)
 
 @COPIES
 @pytest.mark.parametrize("make", [lambda env: TimeLimit(env, 3), OrderEnforcingWrapper])
-def test_copy_of_a_wrapped_environment_keeps_the_wrapper(copied, make):
+def test_copied_env_keeps_its_wrapper(copied, make):
     env = make((aec_env if make is OrderEnforcingWrapper else single_env)(Walk, Walk.choose))
     twin = copied(env)
     assert type(twin) is type(env)
@@ -83,7 +85,7 @@ def test_copy_of_a_wrapped_environment_keeps_the_wrapper(copied, make):
 
 @pytest.mark.parametrize("make", VIEWS.values(), ids=VIEWS)
 @COPIES
-def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
+def test_copied_env_needs_a_reset_if_copied_in_mid_episode(make, copied):
     env = make()
     env.reset(seed=1)
     env.np_random.random(3)
@@ -109,7 +111,7 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @COPIES
-def test_a_copy_has_all_options(copied, driver):
+def test_copied_env_has_all_options(copied, driver):
     """Undecorated points, policies, plugins, variants, rosters and all other options."""
     points = {f"{Walk.__module__}.Walk.drift": define_walk(agent="wind_0"), Walk.choose: None}
     variant = Variant(
@@ -144,7 +146,7 @@ class Model:
 """
 
 
-def test_cloudpickle_takes_a_model_of_the_main_module_to_another_process():
+def test_cloudpickle_carries_an_env_of_a_scripts_model_to_another_process():
     """A model in ``__main__``, with and without decorators, with lambdas, as in a notebook."""
     code = """
 two = define(agent="two_0", action_space_mapping=lambda action: action)

@@ -84,7 +84,7 @@ def look(env, told):
 @pytest.mark.parametrize("view", ["single", "parallel", "joint", "aec"])
 @pytest.mark.parametrize("method", ["fork", "replay"])
 @pytest.mark.parametrize("tree", [False, True])
-def test_changed_observations_reach_no_clone_and_no_state(view, method, tree):
+def test_observation_changed_by_the_user_affects_no_clone_and_no_state(view, method, tree):
     make, action = VIEWS[view]
     options = {"points": points(tree)}
     if not tree:
@@ -112,7 +112,7 @@ def test_changed_observations_reach_no_clone_and_no_state(view, method, tree):
     copied.close()
 
 
-def test_a_planner_that_changes_its_observation_can_branch():
+def test_planning_policy_can_change_its_observation_before_it_branches():
     def grow(env, number):
         return float(env.step(1)[0][0])
 
@@ -124,7 +124,7 @@ def test_a_planner_that_changes_its_observation_can_branch():
     assert [field.height for field in farm.fields] == [104.0, 108.0]
 
 
-def test_an_observation_that_stays_is_another_object_each_time():
+def test_observation_with_equal_values_is_a_new_object_each_time():
     class Herd:
         def reset(self, seed=None):
             self.field = Field()
@@ -146,7 +146,7 @@ def test_an_observation_that_stays_is_another_object_each_time():
         assert same(observations["a"], expected)
 
 
-def test_a_policy_that_changes_its_observation_changes_nothing_else():
+def test_policy_that_changes_its_observation_affects_nothing_else():
     def halve(observation):
         observation /= 2
         return 1
@@ -164,7 +164,7 @@ def test_a_policy_that_changes_its_observation_changes_nothing_else():
 
 
 @pytest.mark.parametrize("make", [parallel_env, single_env, joint_env])
-def test_elapsed_times_count_from_the_last_decision_that_was_asked(make):
+def test_elapsed_time_in_info_counts_skipped_decisions_too(make):
     masks = [[1, 1], [1, 0], [0, 1], [1, 1], [1, 1], [1, 1]]
     decide = decision(
         agent="a",

@@ -43,7 +43,7 @@ def is_blank(env, agent, observation):
 
 @settings(deadline=None)
 @given(EVERYBODY)
-def test_padded_aec_selects_live_agents_only(world):
+def test_pad_agents_of_aec_env_selects_live_agents_only(world):
     def look(agent):
         assert sorted(env.agents) == everybody
         assert env.infos[agent] == {"present": True}
@@ -68,7 +68,7 @@ def test_padded_aec_selects_live_agents_only(world):
 
 @settings(deadline=None)
 @given(EVERYBODY)
-def test_padded_rounds_have_all_agents_and_the_bare_views_results(world):
+def test_pad_agents_of_parallel_env_adds_all_agents_to_its_results(world):
     design, seed, kind = world
     env, bare = (colony(design, kind, parallel_env, padded=padded) for padded in (True, False))
     observations, infos = env.reset(seed=seed)
@@ -113,7 +113,7 @@ VIEWS = [(parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)]
 GENERATIONS = life("1 acts, 1 health 7, 1 leaves, 2 health 1, 2 acts, 2 acts")
 
 
-def test_padded_removed_agents_get_their_reward_then_blanks():
+def test_pad_agents_gives_removed_agents_their_reward_then_blank_values():
     env = begun(pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES)))
     observations, rewards, *_, infos = env.step({"being_1": 3, "being_2": 4})
     assert env.simulation.log == [3]  # the other one was not there yet when it was given
@@ -130,7 +130,7 @@ def test_padded_removed_agents_get_their_reward_then_blanks():
 
 @pytest.mark.parametrize("steps", [1, 2])
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_max_steps_truncate_all_padded_agents(steps, view, action):
+def test_pad_agents_truncates_all_agents_at_max_steps(steps, view, action):
     env = begun(pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, max_steps=steps)), 0)
     for _ in range(steps):
         results = env.step(action)
@@ -139,7 +139,7 @@ def test_max_steps_truncate_all_padded_agents(steps, view, action):
     assert terminations == {"being_1": False, "being_2": False}
 
 
-def test_padded_absent_agents_have_open_masks_and_the_current_time():
+def test_pad_agents_gives_absent_agents_open_masks_and_the_current_time():
     program = "1 acts, 1 o'clock, 1 acts, 1 leaves, 2 o'clock, 2 acts, 3 o'clock, 2 acts"
     masked = beings(
         action_mask_mapping=lambda being: [0, 1, 0],
@@ -175,7 +175,7 @@ def test_padded_absent_agents_have_open_masks_and_the_current_time():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_agents_are_empty_after_an_error_until_the_reset():
+def test_pad_agents_has_no_agents_after_an_error_until_the_reset():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
     env = begun(pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES)), 0)
     with pytest.raises(ZeroDivisionError):
@@ -185,7 +185,7 @@ def test_agents_are_empty_after_an_error_until_the_reset():
     assert sorted(env.agents) == NAMES
 
 
-def test_padding_needs_a_view_of_many_agents_and_a_roster():
+def test_pad_agents_needs_a_multi_agent_env_with_possible_agents():
     for view in (aec_env, parallel_env):
         with pytest.raises(ViewError, match="possible_agents"):
             pad_agents(view(GENERATIONS, beings()))
@@ -195,7 +195,7 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
 
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_a_padded_state_has_blanks_and_a_padded_copy_needs_a_reset(view, action):
+def test_pad_agents_state_has_blanks_and_its_copy_needs_a_reset(view, action):
     env = begun(
         pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations")),
         0,

@@ -122,7 +122,7 @@ def _nothing_is_left():
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("end", ENDS)
-def test_episodes_of_a_dead_worker_end_truncated_and_others_go_on(mode, end):
+def test_vector_env_truncates_the_episodes_of_a_dead_worker(mode, end):
     with warnings.catch_warnings(action="error"):
         unharmed = play(restarting(autoreset_mode=mode), 30)
     envs = restarting(mortal({(3, 2): ENDS[end]}), autoreset_mode=mode)
@@ -171,7 +171,7 @@ def use_and_step(envs, use, actions):
 @pytest.mark.parametrize("kind", ["nested", "masked", "dict action", "goal"])
 @pytest.mark.parametrize("use", ["step", "call", "set_attr", "reset", "partial reset"])
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
-def test_a_worker_that_is_killed_between_steps_is_replaced(kind, use, mode):
+def test_vector_env_replaces_a_worker_killed_between_steps(kind, use, mode):
     model, decision = VARIETY[kind]
     others = set(multiprocessing.active_children())  # of other tests
     envs = restarting(model, {POINT: decision}, autoreset_mode=mode)
@@ -194,7 +194,7 @@ def test_a_worker_that_is_killed_between_steps_is_replaced(kind, use, mode):
     assert not envs.step(actions)[3].any()
 
 
-def test_a_death_in_a_reset_is_repeated_with_the_same_seed(tmp_path):
+def test_vector_env_repeats_a_reset_in_which_a_worker_dies_with_its_seed(tmp_path):
     unharmed = play(restarting(), 5)
     for number, ends in enumerate([{(2, 0)}, {(0, 0), (2, 0), (3, 0)}]):
         envs = restarting(
@@ -205,7 +205,7 @@ def test_a_death_in_a_reset_is_repeated_with_the_same_seed(tmp_path):
         assert envs.restarts == len(ends)
 
 
-def test_an_episode_that_dies_while_it_begins_begins_in_the_new_worker(tmp_path):
+def test_vector_env_begins_an_episode_anew_if_its_worker_dies_in_autoreset(tmp_path):
     """Another simulation of the worker ends in that step, and begins; the dead one is truncated."""
     reset = once(tmp_path / "reset", ENDS["killed"])
 
@@ -237,7 +237,7 @@ def play_again_and_again(envs):
 
 
 @pytest.mark.parametrize("when", [0, 1])
-def test_more_deaths_than_allowed_are_an_error_and_a_reset_goes_on(when, monkeypatch):
+def test_vector_env_raises_an_error_after_more_worker_deaths_than_allowed(when, monkeypatch):
     envs = restarting(mortal({(3, when): ENDS["exited"]}), most_restarts=2)
     with (
         warnings.catch_warnings(action="ignore"),
@@ -256,7 +256,7 @@ def test_more_deaths_than_allowed_are_an_error_and_a_reset_goes_on(when, monkeyp
             envs.step(ONES)
 
 
-def test_an_error_of_a_model_surfaces_although_another_worker_has_died():
+def test_vector_env_raises_a_model_error_even_if_another_worker_dies():
     ends = {(0, 1): lambda: 1 / 0, (3, 1): ENDS["killed"]}
     envs = restarting(mortal(ends))
     envs.reset(seed=0)
@@ -278,7 +278,9 @@ def loop_in_c():
 
 @pytest.mark.parametrize(("hang", "why"), [(loop, "in loop\n"), (loop_in_c, "exit code 1")])
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_a_worker_that_takes_too_long_for_a_step_is_replaced(hang, why, driver, monkeypatch):
+def test_vector_env_replaces_a_worker_that_takes_too_long_for_a_step(
+    hang, why, driver, monkeypatch
+):
     monkeypatch.setattr("simenv_marl.envs.vector_batch.SECONDS_TO_UNWIND", 0.3)
     unharmed = play(restarting(), 3)
     envs = restarting(mortal({(3, 2): hang}), step_timeout=0.3, driver=driver)
@@ -293,7 +295,7 @@ def test_a_worker_that_takes_too_long_for_a_step_is_replaced(hang, why, driver, 
     assert why in infos["lost_why"][3]
 
 
-def test_a_reset_within_a_step_has_no_limit(monkeypatch):
+def test_vector_env_step_timeout_does_not_apply_to_autoresets(monkeypatch):
     monkeypatch.setattr("simenv_marl.envs.vector_batch.SECONDS_TO_UNWIND", 0.1)
 
     class Slow(Mortal):
@@ -308,7 +310,7 @@ def test_a_reset_within_a_step_has_no_limit(monkeypatch):
             play(envs, 12)
 
 
-def test_restarts_need_workers():
+def test_vector_env_refuses_restarts_without_workers():
     with pytest.raises(OptionValueError, match="needs workers="):
         restarting(workers=0)
     with pytest.raises(OptionValueError, match="most_restarts"):
@@ -318,7 +320,7 @@ def test_restarts_need_workers():
 @pytest.mark.thorough
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 @pytest.mark.parametrize("context", [FORK, "spawn"])
-def test_no_process_and_no_descriptor_is_left_behind(context):
+def test_vector_env_close_leaves_no_process_and_no_file_descriptor(context):
     alone(restart_often, context)
 
 

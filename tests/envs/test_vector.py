@@ -53,7 +53,7 @@ PROCESSES = pytest.mark.parametrize("processes", [0, 2])
 @PROCESSES
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", VARIETY)
-def test_matches_sync_vector_env(kind, mode, processes):
+def test_vector_env_matches_gymnasiums_sync_vector_env(kind, mode, processes):
     model, decision = VARIETY[kind]
     points = {POINT: decision}
     options = {"discount_rate": 0.1} if model is TimedCounter else {}
@@ -86,7 +86,7 @@ def test_matches_sync_vector_env(kind, mode, processes):
     st.sampled_from([*[0] * 9, 1, 3]),
 )
 @examples(150)
-def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number, processes):
+def test_vector_env_matches_sync_vector_env_in_random_models(design, seed, mode, number, processes):
     ours = made(design, number, mode, workers=processes, context=FORK)
     if ours is None:
         return
@@ -105,7 +105,7 @@ def begun(envs, seed=0):
 @PROCESSES
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("flatten", [False, True])
-def test_matches_sync_vector_env_over_joint_views(flatten, mode, processes):
+def test_vector_env_of_joint_env_matches_sync_vector_env(flatten, mode, processes):
     given = {"num_envs": 3, "autoreset_mode": mode, "workers": processes, "context": FORK}
     ours = vector_env(Voyage, max_steps=3, flatten=flatten, **given)
     theirs = SyncVectorEnv(
@@ -117,7 +117,7 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode, processes):
     ours.close()
 
 
-def test_vector_env_takes_the_view_as_an_option():
+def test_vector_env_view_option_chooses_single_or_joint_env():
     assert isinstance(
         vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict
     )
@@ -129,7 +129,7 @@ def seeds_of(envs):
     return [simulation.seed for simulation in envs.get_attr("simulation")]
 
 
-def test_vector_reset_takes_one_seed_or_one_per_sub_environment():
+def test_vector_env_reset_takes_one_seed_or_one_per_sub_environment():
     envs, drawn = vector_env(Counter, Counter.decide, num_envs=3), []
     for seed, told in ((7, [7, 8, 9]), (np.int64(4), [4, 5, 6])):
         envs.reset(seed=seed)
@@ -148,7 +148,7 @@ def test_vector_reset_takes_one_seed_or_one_per_sub_environment():
         envs.reset(seed=1.5)
 
 
-def test_reset_mask_resets_some_sub_environments_with_options():
+def test_vector_env_reset_mask_resets_only_some_sub_environments():
     envs = vector_env(Counter, Counter.decide, num_envs=3)
     with pytest.raises(NotResetError, match="no episode yet"):
         envs.step([1, 1, 1])
@@ -168,7 +168,7 @@ def test_reset_mask_resets_some_sub_environments_with_options():
 
 
 @PROCESSES
-def test_without_autoreset_an_ended_episode_must_be_reset(processes):
+def test_vector_env_without_autoreset_needs_a_reset_after_an_episode(processes):
     given = {"autoreset_mode": "Disabled", "max_steps": 1, "workers": processes, "context": FORK}
     envs = begun(vector_env(Counter, Counter.decide, num_envs=3, **given))
     envs.step([1, 1, 1])
@@ -196,7 +196,7 @@ def test_without_autoreset_an_ended_episode_must_be_reset(processes):
         ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
-def test_invalid_options_are_refused(options, error, match):
+def test_vector_env_refuses_invalid_options(options, error, match):
     with pytest.raises(error, match=match):
         vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
@@ -206,7 +206,7 @@ def counts(envs):
 
 
 @PROCESSES
-def test_one_illegal_action_moves_no_sub_environment(processes):
+def test_vector_env_with_one_illegal_action_steps_no_sub_environment(processes):
     envs = begun(
         vector_env(
             Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK
@@ -234,7 +234,7 @@ def test_one_illegal_action_moves_no_sub_environment(processes):
     assert counts(envs) == [1, 1, 1]
 
 
-def test_one_illegal_action_in_a_joint_view_moves_no_sub_environment():
+def test_vector_env_of_joint_env_with_one_illegal_action_steps_none():
     envs = begun(vector_env(Voyage, num_envs=2))
     legal = {"helm_0": np.ones((2, 1)), "sail_0": np.ones((2, 1))}
     for illegal in (
@@ -250,7 +250,7 @@ def test_one_illegal_action_in_a_joint_view_moves_no_sub_environment():
     envs.step(legal)
 
 
-def test_the_action_of_a_reset_sub_environment_is_not_checked():
+def test_vector_env_ignores_the_action_of_a_sub_environment_that_resets():
     envs = begun(vector_env(Counter, Counter.decide, num_envs=2, max_steps=2))
     envs.step([1, 1])
     *_, truncations, _ = envs.step([1, 1])
@@ -262,7 +262,7 @@ def test_the_action_of_a_reset_sub_environment_is_not_checked():
         envs.step([99, -1])
 
 
-def test_boxes_take_actions_in_other_dtypes():
+def test_vector_env_takes_box_actions_in_other_dtypes():
     taken, box = [], VARIETY["box"][1].action_space
     mapping = {"action_space_mapping": lambda action: taken.append(action) or 3}
     envs = begun(vector_env(Counter, {POINT: definition(action_space=box, **mapping)}, num_envs=2))
@@ -282,7 +282,7 @@ def test_boxes_take_actions_in_other_dtypes():
 @PROCESSES
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("kind", ["plain", "nested"])
-def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
+def test_vector_env_observations_are_copies_unless_copy_is_false(kind, copy, processes):
     model, decision = VARIETY[kind]
     envs = vector_env(
         model, {POINT: decision}, num_envs=2, copy=copy, workers=processes, context=FORK
@@ -306,7 +306,7 @@ def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
     "where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"]
 )
 @pytest.mark.parametrize("culprit", [0, 2])
-def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, culprit):
+def test_vector_env_error_names_its_sub_environment_and_reset_recovers(where, culprit):
     def fail(thing):
         if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
             raise ZeroDivisionError
@@ -338,7 +338,7 @@ def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, cu
     assert not stacks(stacks_before)
 
 
-def test_a_failed_reset_or_a_closed_sub_environment_needs_a_full_reset():
+def test_vector_env_needs_a_full_reset_after_a_failed_reset():
     fragile = definition(observation_space_mapping=lambda self: [0, 1 // (self.seed - 66)])
     envs = vector_env(Counter, {POINT: fragile}, num_envs=2)
     with fails(ZeroDivisionError, "sub-environment 1"):
@@ -352,7 +352,7 @@ def test_a_failed_reset_or_a_closed_sub_environment_needs_a_full_reset():
         envs.step([1, 1])
 
 
-def test_sub_environments_are_closed_if_another_one_cannot_be_made():
+def test_vector_env_closes_sub_environments_if_one_cannot_be_made():
     class Own(Counter):
         def decide(self):
             return super().decide()
@@ -364,7 +364,7 @@ def test_sub_environments_are_closed_if_another_one_cannot_be_made():
 
 
 @pytest.mark.parametrize(("driver", "error"), [("greenlet", WrongThreadError), ("thread", None)])
-def test_another_thread_needs_the_thread_driver(driver, error):
+def test_vector_env_needs_the_thread_driver_for_use_in_another_thread(driver, error):
     envs = begun(vector_env(Counter, Counter.decide, num_envs=2, driver=driver))
     with ThreadPoolExecutor(1) as other:
         for method in (lambda: envs.step([1, 1]), lambda: envs.reset(seed=0), envs.close):
@@ -377,7 +377,7 @@ def test_another_thread_needs_the_thread_driver(driver, error):
 
 
 @PROCESSES
-def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
+def test_vector_env_call_get_attr_and_set_attr_reach_sub_environments(processes):
     points = {POINT: VARIETY["goal"][1]}
     envs = begun(
         vector_env(
@@ -411,7 +411,7 @@ def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
     assert envs.unwrapped is envs
 
 
-def test_vector_environments_cannot_be_copied_or_pickled():
+def test_vector_env_cannot_be_copied_or_pickled():
     envs = vector_env(Counter, Counter.decide, num_envs=2)
     for use in (copy.copy, copy.deepcopy, pickle.dumps):
         with pytest.raises(CopyError, match="cannot be copied or pickled"):
@@ -419,7 +419,7 @@ def test_vector_environments_cannot_be_copied_or_pickled():
 
 
 @PROCESSES
-def test_close_unwinds_all_simulations_and_can_be_repeated(processes):
+def test_vector_env_close_unwinds_all_simulations_and_can_be_repeated(processes):
     stacks_before, processes_before = stacks(), set(multiprocessing.active_children())
     for prepare in (
         lambda envs: None,
@@ -447,7 +447,7 @@ def test_close_unwinds_all_simulations_and_can_be_repeated(processes):
     assert set(multiprocessing.active_children()) <= processes_before
 
 
-def test_an_error_of_one_simulation_lets_the_others_unwind():
+def test_vector_env_close_unwinds_all_simulations_even_if_one_fails():
     stacks_before = stacks()
 
     class Stubborn(Counter):
@@ -495,7 +495,7 @@ def test_make_vec_makes_a_vector_env_of_registered_ids(identity):
     envs.close()
 
 
-def test_step_keeps_no_reference_to_decided_values():
+def test_vector_env_step_keeps_no_reference_to_mapped_actions():
     class Answer:
         pass
 

@@ -73,7 +73,7 @@ def goes_on(envs, seed=0):
 @pytest.mark.parametrize(
     ("kind", "context"), [("masked", "spawn"), ("box", FORK), ("image", FORK), ("goal", FORK)]
 )
-def test_async_vector_env_of_single_views_returns_the_same(kind, context, mode):
+def test_vector_env_with_workers_matches_gymnasiums_async_vector_env(kind, context, mode):
     model, decision = VARIETY[kind]
     makers = [partial(single_env, model, {POINT: decision}, driver=driver) for driver in DRIVERS]
     ours = vector_env(model, {POINT: decision}, num_envs=len(makers), autoreset_mode=mode)
@@ -87,7 +87,7 @@ def processes_of(envs):
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
-def test_workers_share_simulations_evenly_and_none_is_idle():
+def test_vector_env_workers_share_simulations_evenly():
     for number, asked, sizes in ((5, 3, [1, 2, 2]), (2, 5, [1, 1])):
         there = processes_of(workers(Failing, num_envs=number, workers=asked))
         assert sorted(map(there.count, set(there))) == sizes
@@ -96,7 +96,7 @@ def test_workers_share_simulations_evenly_and_none_is_idle():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
-def test_models_and_mappings_that_no_module_holds_are_sent_along(context):
+def test_vector_env_workers_get_models_and_mappings_defined_in_functions(context):
     class Local(Counter):
         decide = definition(reward_mapping=lambda self: float(self.seed + self.count))(
             lambda self: 0
@@ -109,13 +109,13 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along(context):
     assert rewards.tolist() == [5.0, 7.0, 9.0]
 
 
-def test_objects_that_cannot_be_pickled_are_refused():
+def test_vector_env_with_workers_refuses_objects_that_cannot_be_pickled():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
 
 
-def test_worker_error_names_the_sub_environment_and_reset_recovers():
+def test_vector_env_worker_error_names_its_sub_environment():
     envs = workers(
         Failing,
         definition(
@@ -134,7 +134,7 @@ def test_worker_error_names_the_sub_environment_and_reset_recovers():
 
 @KILLED
 @pytest.mark.parametrize("code", [-9, 7, 1])
-def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(code):
+def test_vector_env_replaces_a_dead_worker_at_the_next_reset(code):
     envs = workers(Failing)
     end = (lambda: os.kill(os.getpid(), 9)) if code == -9 else (lambda: os._exit(code))
     envs.reset(seed=0, options={"decided": {3: end}})
@@ -154,7 +154,7 @@ def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(code):
 
 @KILLED
 @pytest.mark.parametrize("use", ["step", "call", "close"])
-def test_workers_that_are_killed_between_steps_are_noticed(use):
+def test_vector_env_notices_workers_killed_between_steps(use):
     envs = begun(workers(Failing))
     there = set(processes_of(envs)) if use != "call" else processes_of(envs)[:1]
     for process in there:
@@ -171,7 +171,7 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
     assert envs.closed
 
 
-def test_errors_while_closing_surface_and_the_workers_end():
+def test_vector_env_close_raises_errors_and_ends_its_workers():
     envs = workers(Failing, context=multiprocessing.get_context(FORK))
     envs.reset(
         seed=0, options={"unwinding": dict.fromkeys(range(4), lambda: {}["it would not go"])}
@@ -181,7 +181,7 @@ def test_errors_while_closing_surface_and_the_workers_end():
     assert envs.closed
 
 
-def test_a_second_close_ends_workers_that_an_interrupted_one_has_left(monkeypatch):
+def test_vector_env_second_close_ends_workers_after_an_interrupted_close(monkeypatch):
     envs = begun(workers(Failing))
     there = processes_of(envs)
 
@@ -198,7 +198,7 @@ def test_a_second_close_ends_workers_that_an_interrupted_one_has_left(monkeypatc
     assert all(map(gone, there))
 
 
-def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
+def test_vector_env_workers_end_when_the_env_is_dropped(tmp_path):
     def finish(path):
         time.sleep(0.3)
         path.touch()
@@ -215,7 +215,7 @@ def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
     assert all(map(gone, there))
 
 
-def test_an_environment_closes_although_a_simulation_hangs(monkeypatch):
+def test_vector_env_with_workers_closes_even_if_a_simulation_hangs(monkeypatch):
     monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Failing)
     envs.reset(seed=0, options={"unwinding": {0: partial(time.sleep, 60)}})
@@ -225,7 +225,7 @@ def test_an_environment_closes_although_a_simulation_hangs(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
-def test_an_interrupted_step_leaves_the_workers_usable():
+def test_vector_env_workers_work_after_an_interrupted_step():
     home = os.getpid()
 
     def interrupt(*_):
@@ -275,7 +275,7 @@ if __name__ == "__main__":
     ("end", "status"),
     [("", 0), ("raise KeyboardInterrupt", -2), ("os.kill(os.getpid(), 9)", -9)],
 )
-def test_nothing_stays_behind_when_the_interpreter_ends(context, end, status, tmp_path):
+def test_vector_env_workers_end_with_the_python_process(context, end, status, tmp_path):
     strict = ["-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev"]
     path = tmp_path / "script.py"
     path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
@@ -288,7 +288,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, status, tm
 
 
 @pytest.mark.skipif(FORK != "fork", reason="there is no fork")
-def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
+def test_vector_env_workers_belong_to_the_process_that_started_them():
     envs = begun(workers())
     child = os.fork()
     if child == 0:
@@ -308,7 +308,7 @@ def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
 @pytest.mark.thorough
 @pytest.mark.parametrize("error", ["OSError", "ZeroDivisionError", "WorkerError"])
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
-def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
+def test_vector_env_worker_that_fails_to_start_leaves_no_descriptors(error):
     alone(start_in_vain, error)
 
 
@@ -340,7 +340,7 @@ def start_in_vain(error):
 
 
 @pytest.mark.thorough
-def test_a_script_without_a_main_guard_raises_an_error_that_names_it(tmp_path):
+def test_vector_env_with_workers_names_a_scripts_missing_main_guard(tmp_path):
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
     (tmp_path / "script.py").write_text(text, encoding="utf-8")
     last = python(tmp_path / "script.py", status=1).stderr.strip().splitlines()[-1]

@@ -73,7 +73,9 @@ WRAPPERS = {
 
 
 @pytest.mark.parametrize(("name", "case"), WRAPPERS.items(), ids=WRAPPERS)
-def test_wrappers_work_as_around_an_environment_written_by_hand(name, case, tmp_path, monkeypatch):
+def test_gymnasium_wrappers_work_as_around_an_env_written_by_hand(
+    name, case, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     packages = {package: pytest.importorskip(package) for package in case.needs}
 

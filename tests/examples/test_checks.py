@@ -41,14 +41,14 @@ EXAMPLES = {
 
 
 @pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # of their energy
-def test_gymnasium_accepts_a_herd_as_one_agent():
+def test_gymnasium_check_env_accepts_the_herd_example_in_joint_env():
     herd = [f"sheep_{number}" for number in range(1, 21)]
     check_env(joint_env(meadow, possible_agents=herd, undeclared="rule"), skip_render_check=True)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_check_finds_nothing_in_an_example_whose_environments_pickle(name):
+def test_check_simulation_finds_nothing_in_the_examples(name):
     simulation, points = EXAMPLES[name]
     env = aec_env(simulation, points)
     copied = pickle.loads(pickle.dumps(env))

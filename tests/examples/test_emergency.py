@@ -64,7 +64,7 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_emergency_by_the_rule_equals_the_plain_run_in_every_view(view):
+def test_emergency_envs_with_rule_actions_run_like_the_model_without_env(view):
     make, run = VIEWS[view]
     world = make()
     run(world)
@@ -75,7 +75,7 @@ def test_emergency_by_the_rule_equals_the_plain_run_in_every_view(view):
 # -- the model ------------------------------------------------------------------------------------
 
 
-def test_an_urgent_patient_interrupts_the_treatment_of_a_light_one(monkeypatch):
+def test_emergency_urgent_patient_interrupts_a_light_treatment(monkeypatch):
     monkeypatch.setattr(model, "PACES", model.PACES[:1])  # one doctor
     monkeypatch.setattr(model, "COMPLAINTS", {"light": (0, 0, 1), "urgent": (1, 0, 0)})
     monkeypatch.setattr(model, "MINUTES", {URGENT: 40.0, LIGHT: 300.0})
@@ -101,12 +101,12 @@ def test_an_urgent_patient_interrupts_the_treatment_of_a_light_one(monkeypatch):
     assert urgent.interruptions == 0
 
 
-def test_interrupts_happen_on_usual_days():
+def test_emergency_treatments_are_interrupted_on_usual_days():
     days = [plain(seed) for seed in range(10)]
     assert sum(one.interruptions for day in days for one in day.patients) >= 3
 
 
-def test_arrivals_and_treatments_do_not_depend_on_decisions():
+def test_emergency_arrivals_and_treatments_do_not_depend_on_decisions():
     def last(agent, info):
         return int(info["action_mask"].nonzero()[0][-1]) if "action_mask" in info else RULE
 
@@ -123,7 +123,7 @@ def test_arrivals_and_treatments_do_not_depend_on_decisions():
 # -- the decisions --------------------------------------------------------------------------------
 
 
-def test_masks_follow_from_patients_and_from_beds_that_are_left():
+def test_emergency_action_masks_follow_from_patients_and_free_beds():
     legal, chance = {agent: set() for agent in AGENTS}, random.Random(1)
     world = env()
 
@@ -145,7 +145,7 @@ def test_masks_follow_from_patients_and_from_beds_that_are_left():
 
 
 @pytest.mark.parametrize("first", [0, 1, 2, RULE])
-def test_a_bed_is_given_once_also_beside_answers_of_the_rule(first):
+def test_emergency_bed_is_given_to_one_patient_only(first):
     class Full(EmergencySimulation):
         def run(self):
             free = ["monitored", "plain"]
@@ -165,13 +165,13 @@ def test_a_bed_is_given_once_also_beside_answers_of_the_rule(first):
         assert world.unwrapped.simulation.waiting[0] not in world.unwrapped.simulation.assigned
 
 
-def test_rule_assigns_the_beds_that_other_answers_left():
+def test_emergency_rule_assigns_the_beds_that_are_left():
     patients = [Patient(number, "cough", 0.0, LIGHT) for number in range(3)]
     given = assign(patients, ["plain", "plain", None], None, patients, ["monitored", "plain"])
     assert given == {patients[0]: "plain", patients[1]: "monitored"}
 
 
-def test_questions_and_displays_describe_each_decision():
+def test_emergency_question_and_display_describe_each_decision():
     texts = {}
 
     def note(observation, *, _decision):
@@ -198,7 +198,7 @@ def test_questions_and_displays_describe_each_decision():
 
 
 @pytest.mark.thorough
-def test_doctors_that_plan_are_not_worse_than_the_rule(capsys):
+def test_emergency_doctors_that_plan_are_not_worse_than_the_rule(capsys):
     found = plan.main(["--seeds", "3", "--first", "2", "--futures", "2", "--horizon", "45"])
     assert "standard error" in capsys.readouterr().out
     row = found.summary(metric="cost").loc["doctors plan"]
@@ -206,13 +206,13 @@ def test_doctors_that_plan_are_not_worse_than_the_rule(capsys):
 
 
 @pytest.mark.thorough
-def test_simulate_and_evaluate_find_the_same_gain():
+def test_emergency_simulate_and_evaluate_find_the_same_gain():
     seeds, options = [1], {"futures": 2, "horizon": 45.0}
     found = plan.compare(seeds, **options).summary(metric="cost")
     assert plan.gains(seeds, **options) == [pytest.approx(-found["difference"]["doctors plan"])]
 
 
-def test_planner_does_not_foresee_treatments_of_waiting_patients():
+def test_emergency_reseed_draws_new_treatments_of_waiting_patients():
     def work(seed):
         simulation = EmergencySimulation()
         simulation.reset(seed=1)
@@ -224,7 +224,7 @@ def test_planner_does_not_foresee_treatments_of_waiting_patients():
     assert work(5) == work(5) != work(6)
 
 
-def test_the_model_runs_without_an_environment():
+def test_emergency_model_runs_without_an_environment():
     assert history(plain(0, model.Generators)) == history(plain(0, model.Generators))
     command = [sys.executable, "-m", "examples.emergency.model"]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout

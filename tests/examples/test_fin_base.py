@@ -13,7 +13,7 @@ def fund(years, coverage):
     return FundSim(years, pension.Parameters(clients=60, coverage=coverage))
 
 
-def test_no_cent_is_lost_by_random_legal_actions():
+def test_pension_fund_loses_no_money_with_random_legal_actions():
     generator = np.random.default_rng(0)
 
     def draw(agent, env):
@@ -28,7 +28,7 @@ def test_no_cent_is_lost_by_random_legal_actions():
 
 
 @pytest.mark.parametrize(("coverage", "ends"), [(0.02, [True, False]), (1.5, [False, True])])
-def test_an_episode_ends_with_unpaid_pensions_or_with_its_last_year(coverage, ends):
+def test_pension_fund_episode_ends_with_unpaid_pensions_or_its_last_year(coverage, ends):
     manager = {
         point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"
     }
@@ -41,13 +41,13 @@ def test_an_episode_ends_with_unpaid_pensions_or_with_its_last_year(coverage, en
     assert bool(environment.simulation.fund.company.rations) == ends[0]
 
 
-def test_the_model_prints_its_years(capsys):
+def test_pension_fund_model_prints_its_years(capsys):
     pension.main(["--clients", "30", "--years", "2"])
     assert "years a second" in capsys.readouterr().out
 
 
 @pytest.mark.thorough
-def test_training_is_determined_by_its_seed(capsys):
+def test_pension_fund_training_depends_only_on_its_seed(capsys):
     options = [
         "--clients",
         "30",

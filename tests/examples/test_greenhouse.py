@@ -13,7 +13,7 @@ from pettingzoo.test import api_test, parallel_api_test
 from tests.worlds.models import play
 
 
-def test_the_model_prints_its_days_as_in_the_paper(capsys):
+def test_greenhouse_prints_its_days_as_in_the_paper(capsys):
     model.main(["--seed", "1"])
     lines = capsys.readouterr().out.splitlines()
     days = [re.fullmatch(r"day (\d+) alive: (\d+), dead: (\d+)", line).groups() for line in lines]
@@ -25,7 +25,7 @@ def test_the_model_prints_its_days_as_in_the_paper(capsys):
     assert alive[-1] == 0  # the rule means too well
 
 
-def test_a_day_has_the_numbers_of_the_paper():
+def test_greenhouse_day_has_the_numbers_of_the_paper():
     house = model.Greenhouse(5)
     house.update_temperature = lambda: None  # 20 degrees
     house.update_day()
@@ -33,12 +33,12 @@ def test_a_day_has_the_numbers_of_the_paper():
     assert (house.water_use, house.day) == (200, 1)
 
 
-def test_pettingzoo_accepts_the_greenhouse():
+def test_greenhouse_passes_pettingzoos_tests():
     api_test(env(), num_cycles=100)
     parallel_api_test(parallel_env(), num_cycles=100)
 
 
-def test_an_episode_ends_with_the_last_plant_or_after_a_hundred_days():
+def test_greenhouse_episode_ends_with_the_last_plant_or_after_100_days():
     environment = raw_env()
     dead = play(environment, seed=1)
     assert [turn[3:5] for turn in dead[-2:]] == [(True, False)] * 2
@@ -53,14 +53,14 @@ def test_an_episode_ends_with_the_last_plant_or_after_a_hundred_days():
     ("name", "options"),
     [("Watering", {}), ("Ventilation", {}), ("Joint", {}), ("Joint", {"flatten": True})],
 )
-def test_the_greenhouse_passes_gymnasiums_check(name, options):
+def test_greenhouse_passes_gymnasiums_check_env(name, options):
     environment = gymnasium.make(f"greenhouse_coop/{name}-v0", **options)
     check_env(environment.unwrapped)
     environment.close()
 
 
 @pytest.mark.thorough
-def test_training_is_worth_it():
+def test_greenhouse_training_beats_the_models_rule():
     generations, seeds = 3, range(train.HELD_OUT, train.HELD_OUT + 8)
     # what searching finds
     pair = {"waterer_0": train.Constant(0.084), "ventilator_0": train.Constant(1.0)}

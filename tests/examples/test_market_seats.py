@@ -5,7 +5,7 @@ from examples.market_seats.env import AGENTS, Free, Levied
 from simenv_marl import simulate
 
 
-def test_levy_leads_the_rule_to_the_best_joint_profit():
+def test_market_levy_leads_the_models_rule_to_the_best_joint_profit():
     def traders(condition, policies):
         return simulate(condition, policies, seed=1).market.traders
 

@@ -22,7 +22,7 @@ def told_of(model):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("example", mesa_models.EXAMPLES, ids=lambda example: example.__name__)
-def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
+def test_mesa_example_envs_with_rule_actions_run_like_models_without_env(example):
     if example is mesa_models.wolf_sheep and mesa_models.NEEDS_SIMULATOR:
         pytest.skip("this Mesa runs it by a simulator: tests/contract/test_mesa.py")
     outcome = mesa_models.outcome(example)
@@ -38,10 +38,10 @@ def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
         assert printed[:3] == told_of(outcome.model)[:3]
 
 
-def test_the_program_prints_a_table(capsys):
+def test_mesa_example_program_prints_a_table(capsys):
     mesa_models.main(["boltzmann_wealth"])
     assert "| `BoltzmannWealth` | `MoneyAgent.move` |" in capsys.readouterr().out
 
 
-def test_every_model_of_mesa_is_there():
+def test_mesa_example_covers_every_model_of_mesa():
     assert {example()[0].__name__ for example in mesa_models.EXAMPLES} >= set(mesa.examples.__all__)

@@ -61,7 +61,7 @@ for points in (["model.Greenhouse.choose_water_amount"], []):
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not at hand")
-def test_showcase_runs_and_its_rule_matches_the_plain_model(tmp_path):
+def test_paper_showcase_with_rule_actions_runs_like_the_model_without_env(tmp_path):
     text = PAPER.read_text(encoding="utf-8")
     for old, new in CHANGES.items():
         text, times = re.subn(rf"^{re.escape(old)}$", new, text, flags=re.MULTILINE)

@@ -27,7 +27,7 @@ def earned(policies, seeds):
     )
 
 
-def test_discounting_by_decision_misses_the_optimum():
+def test_queue_admission_discounting_by_decision_misses_the_optimum():
     optimum = worth(best_table())
     assert round(optimum, 3) == 4.458
     assert round(worth(ADMIT_ALL) / optimum, 2) == 0.76
@@ -39,7 +39,7 @@ def test_discounting_by_decision_misses_the_optimum():
 
 
 @pytest.mark.thorough
-def test_value_of_a_table_matches_its_returns_in_the_model():
+def test_queue_admission_table_value_matches_returns_in_the_model():
     best, seeds = best_table(), range(300)
     gains = earned({AGENT: policy_of(best)}, seeds) - earned({}, seeds)
     expected = values(best)[EMPTY] - values(ADMIT_ALL)[EMPTY]

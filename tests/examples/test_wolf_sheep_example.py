@@ -7,7 +7,7 @@ from simenv_marl import RULE
 from simenv_marl.data import collect_episodes
 
 
-def test_lives_begin_with_births_and_end_with_deaths():
+def test_wolf_sheep_agents_begin_with_births_and_end_with_deaths():
     def alive(meadow):
         return {f"sheep_{sheep.unique_id}" for sheep in meadow.sheep}, numbers(meadow)["sheep"]
 

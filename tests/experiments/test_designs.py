@@ -55,7 +55,7 @@ def values(table, name):
     n=st.sampled_from([2, 4, 8, 16]),
     seed=st.integers(0, 99),
 )
-def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n, seed):
+def test_design_values_are_of_the_factors_and_repeatable(factors, method, n, seed):
     chosen = n if method in (*SIZED, "saltelli") else None
     try:
         table = design(factors, method, chosen, seed=seed)
@@ -73,7 +73,7 @@ def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_columns_have_the_types_of_the_factors(method):
+def test_design_columns_have_the_types_of_the_factors(method):
     factors = {
         "f": (0.0, 1),
         "i": (1, 9),
@@ -94,7 +94,7 @@ def test_columns_have_the_types_of_the_factors(method):
     )
 
 
-def test_a_full_factorial_has_all_combinations():
+def test_design_full_factorial_has_all_combinations():
     table = design({"a": [3, 1], "b": ["x", "y", "z"], "c": (0.0, 1.0)}, n=3)
     expected = list(itertools.product([3, 1], "xyz", [0.0, 0.5, 1.0]))
     assert list(table.itertuples(index=False, name=None)) == expected
@@ -105,7 +105,7 @@ def test_a_full_factorial_has_all_combinations():
 @pytest.mark.parametrize(
     "bounds", [(0, 2**53), (-(2**53), 2**53), (1, 2**53 - 1), (-7, 7)], ids=str
 )
-def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
+def test_design_integer_ranges_stay_integers_and_reach_their_bounds(bounds):
     low, high = bounds
     for method, number in (
         ("full_factorial", 3),
@@ -133,7 +133,7 @@ def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
         (9, 128, 1),
     ],
 )
-def test_a_fraction_is_balanced_and_orthogonal(number, n, clear):
+def test_design_fractional_factorial_is_balanced_and_orthogonal(number, n, clear):
     table = design({f"x{place}": (-1, 1) for place in range(number)}, "fractional_factorial", n)
     matrix = table.to_numpy()
     assert len(table) == n
@@ -144,7 +144,7 @@ def test_a_fraction_is_balanced_and_orthogonal(number, n, clear):
 
 
 @pytest.mark.parametrize("number", [*range(1, 20), 24, 27])
-def test_plackett_burman_is_orthogonal_in_few_runs(number):
+def test_design_plackett_burman_is_orthogonal_in_few_runs(number):
     table = design({f"x{place}": (-1, 1) for place in range(number)}, "plackett_burman")
     matrix = table.to_numpy()
     assert len(table) % 4 == 0
@@ -152,7 +152,7 @@ def test_plackett_burman_is_orthogonal_in_few_runs(number):
     assert (matrix.T @ matrix == len(table) * np.eye(number)).all()
 
 
-def test_a_latin_hypercube_has_one_row_in_each_slice():
+def test_design_latin_hypercube_has_one_row_in_each_slice():
     factors = {"f": (0.0, 10.0), "i": (1, 10), "s": list("abcde")}
     table = design(factors, "latin_hypercube", 10, seed=3)
     assert sorted(int(value) for value in table["f"]) == list(range(10))
@@ -163,12 +163,12 @@ def test_a_latin_hypercube_has_one_row_in_each_slice():
         design(factors, "latin_hypercube", 10, seed=-1)
 
 
-def test_rounded_samples_stay_within_their_range():
+def test_design_rounded_samples_stay_within_their_range():
     narrow = design({"x": (0.1, np.nextafter(0.1, 1))}, "latin_hypercube", 64)["x"]
     assert set(narrow) == {0.1, np.nextafter(0.1, 1)}
 
 
-def test_one_at_a_time_changes_one_factor():
+def test_design_one_at_a_time_changes_one_factor_per_row():
     table = design({"a": (0, 10), "b": ["x", "y", "z"], "c": (0.0, 1.0)}, "one_at_a_time")
     changed = [
         (0, "x", 0.5),
@@ -181,7 +181,7 @@ def test_one_at_a_time_changes_one_factor():
     assert list(table.itertuples(index=False, name=None)) == [(5, "x", 0.5), *changed]
 
 
-def test_a_central_composite_design_lies_within_the_ranges():
+def test_design_central_composite_lies_within_the_ranges():
     table = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
     assert len(table) == 9
     assert (table.min().tolist(), table.max().tolist()) == ([0.0, -4.0], [2.0, 4.0])
@@ -191,7 +191,7 @@ def test_a_central_composite_design_lies_within_the_ranges():
 THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (0, 1)}
 
 
-def test_arrays_can_be_levels():
+def test_design_levels_can_be_arrays():
     one, other = np.zeros(2), np.ones(2)
     assert design({"start": [one, other]})["start"].tolist() == [one, other]
 
@@ -232,12 +232,12 @@ def test_arrays_can_be_levels():
         ("more than 10,000,000", ({f"x{i}": list(range(100)) for i in range(4)},)),
     ],
 )
-def test_invalid_designs_are_refused(match, arguments):
+def test_design_refuses_invalid_arguments(match, arguments):
     with pytest.raises(OptionValueError, match=match):
         design(*arguments)
 
 
-def test_pydoe_is_found_under_either_name_or_its_extra_is_named(monkeypatch):
+def test_design_finds_pydoe_under_either_name_or_names_its_extra(monkeypatch):
     expected = design({"x": (0.0, 1.0)}, "plackett_burman")
     monkeypatch.setitem(sys.modules, "pyDOE", pydoe)  # its name in releases for older NumPy
     monkeypatch.setitem(sys.modules, "pydoe", None)

@@ -27,7 +27,7 @@ def linear(a=0, b=0, c="x", seed=0):
     return a + 2 * b * (1 if c == "x" else 3)
 
 
-def test_main_effects_and_interactions_match_a_known_model(tmp_path):
+def test_effects_and_interactions_match_a_known_model(tmp_path):
     def model(**row):
         return Script(lambda simulation: simulation.log.append(linear(**row)))
 
@@ -55,7 +55,7 @@ def test_main_effects_and_interactions_match_a_known_model(tmp_path):
         found.cells("a", "z")
 
 
-def test_factor_with_many_values_is_grouped_into_quarters():
+def test_effects_group_a_factor_with_many_values_into_quarters():
     found = effects(
         told(design({"a": (0.0, 1.0), "b": (0.0, 1.0), "c": ["x", "y"]}, "sobol", 64), linear)
     )
@@ -72,7 +72,7 @@ def test_factor_with_many_values_is_grouped_into_quarters():
     assert found["mean"].is_monotonic_increasing
 
 
-def test_missing_values_of_a_factor_are_one_level():
+def test_effects_treat_missing_values_of_a_factor_as_one_level():
     table = pd.DataFrame({"a": [0, 1, 0, 1], "b": 0.0, "c": [1.0, 1.0, math.nan, math.nan]})
     found = effects(told(table, lambda a, b, c, seed: a))
     assert found.main.loc["c"][["mean", "count"]].values.tolist() == [[0.5, 4], [0.5, 4]]
@@ -80,7 +80,7 @@ def test_missing_values_of_a_factor_are_one_level():
     assert [label.get_text() for label in found.plot().axes[1].get_xticklabels()] == ["1", "nan"]
 
 
-def test_many_factors_are_drawn_in_rows():
+def test_effects_plot_draws_many_factors_in_rows():
     table = design({f"x{place}": [0, 1] for place in range(7)}, "plackett_burman")
     figure = effects(told(table, lambda seed, **row: sum(row.values()))).plot()
     drawn = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
@@ -117,7 +117,7 @@ def test_effects_refuse_invalid_arguments():
                 look(table, **given)
 
 
-def test_intervals_of_effects_measure_variation_over_seeds_only():
+def test_effects_intervals_measure_variation_over_seeds_only():
     noise = {"quiet": 0, "still": 0, "loud": 4}
     table, value = (
         design({"a": list(noise), "b": [0, 1]}),
@@ -142,7 +142,7 @@ def test_effects_on_proportions_have_wilson_intervals():
         assert found.loc[("a", a), ["low", "high"]].tolist() == pytest.approx(list(expected))
 
 
-def test_levels_that_are_equal_but_of_other_types_are_refused():
+def test_effects_refuse_equal_levels_of_different_types():
     frame = told(design({"a": [False, 0, 1.0], "b": ["x", "y"]}), lambda a, b, seed: seed)
     with pytest.raises(OptionValueError, match="'a' has levels that are equal"):
         effects(frame)
@@ -152,7 +152,7 @@ def test_levels_that_are_equal_but_of_other_types_are_refused():
     assert "_cells" not in repr(found)
 
 
-def test_the_mean_lies_in_its_interval_where_runs_have_failed():
+def test_effects_mean_lies_in_its_interval_if_runs_have_failed():
     frame = told(
         design({"a": [0, 1], "b": [0, 1]}), lambda a, b, seed: 100 * b + seed / 10 + a, range(8)
     )

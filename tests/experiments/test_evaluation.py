@@ -48,7 +48,7 @@ def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
     return found
 
 
-def test_the_frame_has_a_row_for_each_agent_and_one_for_the_team():
+def test_evaluate_frame_has_a_row_for_each_agent_and_the_team():
     found = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, metric={"level": level})
     frame = found.frame
     assert list(frame.columns) == ["contender", "seed", "agent", "return", "length", "level"]
@@ -75,7 +75,7 @@ def by_number(observation):
 @EVERY_DRIVER
 @pytest.mark.parametrize("options", [{}, {"max_steps": 5}], ids=str)
 @pytest.mark.parametrize("batched", [False, True])
-def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched, options):
+def test_evaluate_returns_match_aec_env_with_births_and_deaths(batched, options):
     def make():
         return Colony(COLONY)
 
@@ -101,7 +101,7 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
 
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
-def test_planners_decide_as_they_do_in_simulate(arguments):
+def test_evaluate_runs_planning_policies_as_simulate_does(arguments):
     planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1, method="replay")
     contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
     found = evaluate(
@@ -120,7 +120,7 @@ MIXED = {
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_mixtures_decide_as_policies_of_many(workers, capsys):
+def test_evaluate_runs_a_mixture_as_simulate_many_does(workers, capsys):
     found = evaluate(
         Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers, progress=True
     )
@@ -136,7 +136,7 @@ def test_mixtures_decide_as_policies_of_many(workers, capsys):
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
-def test_the_summary_is_paired_by_seed(confidence):
+def test_evaluate_summary_is_paired_by_seed(confidence):
     contenders = {"rule": {}, "some": {"keeper": some}}
     given = {"points": POINTS, "confidence": confidence}
     found = evaluate(Shop, contenders, seeds=range(32), baseline="rule", **given)
@@ -189,7 +189,7 @@ def test_the_summary_is_paired_by_seed(confidence):
         *((equal, "equal", False) for equal in ([2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0])),
     ],
 )
-def test_interval_is_nan_with_a_reason_where_none_can_be_computed(values, note, proportion):
+def test_evaluate_interval_is_nan_with_a_reason_if_it_has_no_value(values, note, proportion):
     low, high, why = interval(np.array(values), 0.95, proportion=proportion)
     assert np.isnan([low, high]).all()
     assert note in why
@@ -200,20 +200,20 @@ def test_interval_is_nan_with_a_reason_where_none_can_be_computed(values, note, 
 @pytest.mark.parametrize(
     ("name", "least"), [("normal", 0.93), ("lognormal", 0.78), ("0/1, p=0.5", 0.9)]
 )
-def test_intervals_cover_and_equal_contenders_seldom_differ(name, least, number):
+def test_evaluate_intervals_cover_the_true_mean(name, least, number):
     covered, unknown, different = measure(name, number, 600)
     assert covered > least
     assert unknown < 0.02
     assert different < 0.08
 
 
-def test_events_that_were_not_seen_have_no_interval_of_zero_width():
+def test_evaluate_gives_no_zero_width_interval_for_unseen_events():
     covered, unknown, _ = measure("0/1, p=0.1", 5, 600)
     assert covered > 0.8  # of those that are known; with Student's t it was 0.4
     assert 0.25 < unknown < 0.45
 
 
-def test_summary_notes_missing_intervals_and_ties_count_half():
+def test_evaluate_summary_notes_missing_intervals_and_counts_ties_half():
     contenders = {"a": {}, "same": {}, "some": {"keeper": some}, "much": {"keeper": much}}
     found = evaluate(
         Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1}
@@ -241,7 +241,7 @@ def test_summary_notes_missing_intervals_and_ties_count_half():
     found.plot()
 
 
-def test_proportions_have_wilson_intervals_even_with_missing_values():
+def test_evaluate_gives_proportions_wilson_intervals():
     some_seeds = np.arange(12) < 3
     wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
     student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
@@ -259,14 +259,14 @@ def test_proportions_have_wilson_intervals_even_with_missing_values():
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
 @pytest.mark.parametrize(("size", "power"), [(0.1, 0.5), (0.5, 0.8), (1.5, 0.99)])
-def test_the_number_of_seeds_is_that_of_the_paired_t_test(size, power, confidence):
+def test_evaluate_seeds_needed_are_those_of_a_paired_t_test(size, power, confidence):
     apart = np.random.default_rng(1).normal(size=20)
     found = Evaluation(of_teams(a=np.zeros(20), b=apart), "a", confidence)
     expected = TTestPower().solve_power(effect_size=size, alpha=1 - confidence, power=power)
     assert found.seeds_needed(size * apart.std(ddof=1), power=power)["b"] == np.ceil(expected)
 
 
-def test_seeds_needed_are_bounded_and_wrong_differences_are_refused():
+def test_evaluate_seeds_needed_are_bounded():
     returns = of_teams(a=[0, 0, 0], b=[1, 2, 3], same=[0, 0, 0])
     found = Evaluation(returns, "a", 0.95)
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):
@@ -284,7 +284,7 @@ def test_seeds_needed_are_bounded_and_wrong_differences_are_refused():
         Evaluation(returns, None, 0.95).seeds_needed(1)
 
 
-def test_evaluation_stops_as_soon_as_intervals_are_narrow_enough():
+def test_evaluate_stops_as_soon_as_intervals_are_narrow_enough():
     def seeds_run(contenders, number, **given):
         return len(evaluate(Shop, contenders, seeds=range(number), points=POINTS, **given).values())
 
@@ -298,7 +298,7 @@ def test_evaluation_stops_as_soon_as_intervals_are_narrow_enough():
     assert float((summary["high"] - summary["low"]).iloc[0]) <= 2.0
 
 
-def test_team_argument_computes_the_return_of_the_team():
+def test_evaluate_team_argument_computes_the_return_of_the_team():
     def team(returns):
         assert "keeper" in returns
         assert "stranger" not in returns
@@ -330,7 +330,9 @@ def test_team_argument_computes_the_return_of_the_team():
     ],
     ids=["team", "policy"],
 )
-def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, given, arguments):
+def test_evaluate_raises_errors_at_once_and_names_the_seed(
+    match, contender, keeper, given, arguments
+):
     with fails(KeyError, "seed 0", f"of the contender '{contender}'", match=match):
         evaluate(
             Shop,
@@ -342,7 +344,7 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
         )
 
 
-def test_a_variant_brings_its_own_points_and_policies():
+def test_evaluate_uses_a_variants_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
     assert "error" not in frame, set(frame["error"])
@@ -354,7 +356,7 @@ def test_a_variant_brings_its_own_points_and_policies():
     assert frame[frame.agent == "team"]["metric"].tolist() == expected
 
 
-def test_pictures_show_each_seed_and_can_be_read():
+def test_evaluate_plot_shows_each_seed():
     def drawn(contenders, seeds, **given):
         return evaluate(Shop, contenders, seeds=seeds, points=POINTS, metric=level, **given)
 
@@ -407,7 +409,7 @@ def returning(what):
         ("of 'keeper' in 'mixed', <Mixture.*batched=True", {"contenders": MIXED}),
     ],
 )  # fmt: skip
-def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
+def test_evaluate_refuses_invalid_arguments_before_it_runs(match, arguments):
     made = []
     given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
     with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
@@ -415,13 +417,13 @@ def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
     assert len(made) <= len(POINTS)  # looked at, and not run
 
 
-def test_an_agent_must_not_be_called_team():
+def test_evaluate_refuses_an_agent_called_team():
     points = {Shop.order: replace(POINTS[Shop.order], agent="team")}
     with pytest.raises(AgentError, match="team"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
 
 
-def test_metrics_are_numbers_strings_or_none():
+def test_evaluate_metrics_are_numbers_strings_or_none():
     metrics = {
         "float": lambda shop: np.float32(0.5),
         "array": lambda shop: np.array(3),
@@ -450,18 +452,18 @@ def test_metrics_are_numbers_strings_or_none():
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop: [1]})
 
 
-def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+def test_evaluate_error_names_the_extra_of_a_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[experiments\]"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)
 
 
-def test_import_loads_neither_testing_nor_experiment_dependencies():
+def test_importing_the_library_does_not_import_optional_dependencies():
     names = {"pandas", "scipy.stats", "pydoe", "SALib", "simenv_marl.testing"}
     assert run_code(f"import sys, simenv_marl; print({names} & sys.modules.keys())") == "set()\n"
 
 
-def test_two_points_of_the_same_agent_have_one_row(monkeypatch):
+def test_evaluate_frame_has_one_row_for_an_agent_with_two_decision_points(monkeypatch):
     class Doubled(Shop):
         order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
 

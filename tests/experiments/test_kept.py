@@ -71,7 +71,7 @@ def end_at(seed, error=KeyboardInterrupt):
     [{}, {"workers": 2}, MANY, MANY | {"batch_size": 2}, MANY | {"workers": 2}, {"width": 50.0}],
     ids=plainly,
 )
-def test_kept_evaluation_equals_a_plain_one(arguments, tmp_path, capsys):
+def test_evaluate_with_a_store_equals_evaluate_without(arguments, tmp_path, capsys):
     arguments = {"seeds": range(20)} | arguments
     plain = run(None, **arguments)
     number = 3 * len(plain.values())
@@ -83,7 +83,7 @@ def test_kept_evaluation_equals_a_plain_one(arguments, tmp_path, capsys):
     assert capsys.readouterr().err.count(f"{number}/60") >= 2
 
 
-def test_second_call_runs_only_new_seeds_and_contenders(tmp_path):
+def test_evaluate_with_a_store_runs_only_new_seeds_and_contenders(tmp_path):
     shop, begun = end_at(None)
     few = {"rule": {}, "much": {"keeper": much}}
     run(tmp_path, shop, contenders=few)
@@ -96,7 +96,7 @@ def test_second_call_runs_only_new_seeds_and_contenders(tmp_path):
     assert len(begun) == 8
 
 
-def test_progress_bar_begins_with_the_stored_episodes(tmp_path, capsys):
+def test_evaluate_progress_bar_begins_with_the_stored_episodes(tmp_path, capsys):
     run(tmp_path)
     run(tmp_path, seeds=range(6), progress=True)
     shown = capsys.readouterr().err
@@ -104,7 +104,7 @@ def test_progress_bar_begins_with_the_stored_episodes(tmp_path, capsys):
     assert " 18/18 " in shown
 
 
-def test_counts_of_policies_are_kept(tmp_path):
+def test_evaluate_store_keeps_counts_of_fallback_policies(tmp_path):
     def late(observation):
         raise ValueError
 
@@ -118,7 +118,7 @@ def test_counts_of_policies_are_kept(tmp_path):
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, MANY | {"batch_size": 1}], ids=plainly)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, TimeoutError])
-def test_interrupts_and_errors_keep_finished_runs(error, arguments, tmp_path):
+def test_evaluate_store_keeps_finished_runs_after_interrupts_and_errors(error, arguments, tmp_path):
     if error is KeyboardInterrupt and "workers" in arguments:
         pytest.skip("an interrupt reaches the parent; the kills below end workers")
     shop, begun = end_at(2, error)
@@ -137,7 +137,7 @@ def test_interrupts_and_errors_keep_finished_runs(error, arguments, tmp_path):
     assert found.frame.equals(run(None, contenders={"rule": {}}).frame)
 
 
-def test_episode_of_a_torn_line_is_run_again(tmp_path):
+def test_evaluate_store_runs_the_episode_of_a_torn_line_again(tmp_path):
     whole = run(tmp_path)
     (path,) = tmp_path.glob("*.jsonl")
     path.write_bytes(path.read_bytes()[:-9])
@@ -148,7 +148,7 @@ def test_episode_of_a_torn_line_is_run_again(tmp_path):
     assert len(keys(tmp_path)) == 12
 
 
-def test_line_is_written_by_the_process_that_ran_the_episode(tmp_path):
+def test_evaluate_store_line_is_written_by_the_process_that_ran_it(tmp_path):
     run(tmp_path, workers=2, metric=lambda shop: os.getpid(), seeds=range(8))
     for path in tmp_path.glob("*.jsonl"):
         for line in path.read_text().splitlines():
@@ -156,7 +156,7 @@ def test_line_is_written_by_the_process_that_ran_the_episode(tmp_path):
     assert len(keys(tmp_path)) == 24
 
 
-def test_other_metrics_and_stores_of_experiments_are_refused(tmp_path):
+def test_evaluate_refuses_a_store_of_other_metrics_or_experiments(tmp_path):
     shop, begun = end_at(None)
     run(tmp_path / "own")
     experiment = {"seeds": [0], "points": POINTS, "metric": {"level": level}}
@@ -177,7 +177,7 @@ def test_other_metrics_and_stores_of_experiments_are_refused(tmp_path):
     assert begun == []
 
 
-def test_invalid_arguments_create_no_store(tmp_path):
+def test_evaluate_with_invalid_arguments_creates_no_store(tmp_path):
     for arguments in ({"baseline": "x"}, {"contenders": {"a": {"nobody.at": some}}}, {"team": 3}):
         with pytest.raises((OptionValueError, ValueError, LookupError)):
             run(tmp_path / "store", **arguments)
@@ -197,7 +197,7 @@ def test_invalid_arguments_create_no_store(tmp_path):
         (r"variant null then, v now", {"simulation": Variant("v", Shop)}),
     ],
 )
-def test_other_definitions_are_warned_of(told, arguments, tmp_path):
+def test_evaluate_warns_if_stored_runs_had_other_definitions(told, arguments, tmp_path):
     first = run(tmp_path)
     with pytest.warns(UserWarning, match=told):
         frame = run(tmp_path, baseline=None, **arguments).frame
@@ -206,13 +206,13 @@ def test_other_definitions_are_warned_of(told, arguments, tmp_path):
 
 
 @pytest.mark.thorough
-def test_equal_definitions_are_not_warned_of(tmp_path):
+def test_evaluate_does_not_warn_if_stored_runs_had_equal_definitions(tmp_path):
     run(tmp_path, lambda: Shop(2), workers=2, driver="thread")
     run(tmp_path, lambda: Shop(2), points=dict(reversed(POINTS.items())))
     assert len(keys(tmp_path)) == 12
 
 
-def test_runs_with_wrong_numbers_are_run_again(tmp_path):
+def test_evaluate_store_repeats_runs_with_wrong_numbers(tmp_path):
     class Fresh(Casino):
         """One of which nobody was warned yet."""
 
@@ -225,7 +225,7 @@ def test_runs_with_wrong_numbers_are_run_again(tmp_path):
     assert len(keys(tmp_path)) == 4
 
 
-def test_team_is_computed_anew(tmp_path):
+def test_evaluate_computes_the_team_return_anew_from_its_store(tmp_path):
     with pytest.raises(KeyError, match=r"'stranger' .*did not decide") as caught:
         run(tmp_path, team=lambda returns: returns["stranger"])
     assert "of the contender 'rule'; seed 0" in "".join(caught.value.__notes__)
@@ -238,7 +238,7 @@ def test_team_is_computed_anew(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_misnamed_agent_is_an_error_and_its_runs_are_not_stored(workers, tmp_path):
+def test_evaluate_refuses_a_misnamed_agent_and_stores_none_of_its_runs(workers, tmp_path):
     contenders = {"right": {"being_1": much}, "wrong": {"beeing_1": much}}
     given = {"seeds": range(3), "points": beings(), "store": tmp_path, "workers": workers}
     with pytest.raises(AgentError, match="'wrong' has a policy for 'beeing_1'"):
@@ -293,7 +293,7 @@ if __name__ == "__main__":
 @pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_kills_lose_no_finished_episode_and_count_none_twice(workers, tmp_path):
+def test_evaluate_store_survives_kills_without_losing_finished_episodes(workers, tmp_path):
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(SCRIPT, encoding="utf-8")
     seeds = 60 * KILLS * (1 + workers)

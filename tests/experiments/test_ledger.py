@@ -81,7 +81,9 @@ def returns_of(simulation, points, policies, seed, **options):
     steps=st.none() | st.integers(1, 12),
 )
 @examples(WORLDS)
-def test_contributions_add_up_to_the_difference(seed, driver, method, forced, steps):
+def test_ledger_contributions_add_up_to_the_difference_of_returns(
+    seed, driver, method, forced, steps
+):
     options = {"points": FAIR_POINTS, "skip_forced": forced, "max_steps": steps, "driver": driver}
     found = ledger(Fair, FAIR_POLICIES, seeds=[seed], method=method, **options)
     made = returns_of(Fair, policies=FAIR_POLICIES, seed=seed, **options)
@@ -93,7 +95,7 @@ def test_contributions_add_up_to_the_difference(seed, driver, method, forced, st
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_ledger_baseline_may_be_any_policies(method):
+def test_ledger_baseline_can_be_any_policies(method):
     for baseline in (boldest, dict.fromkeys(FAIR_POINTS, boldest), {"warden_0": boldest}):
         by_point = baseline if isinstance(baseline, dict) else dict.fromkeys(FAIR_POINTS, baseline)
         found = ledger(
@@ -156,7 +158,7 @@ def test_ledger_can_use_a_metric_or_team_reward_in_place_of_rewards():
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
-def test_ledger_copies_the_global_generators(driver):
+def test_ledger_futures_use_copies_of_the_global_generators(driver):
     class Thrown(Dice):
         reseed = None
 
@@ -172,7 +174,7 @@ def test_ledger_copies_the_global_generators(driver):
     assert found.frame["luck"].abs().max() > 0
 
 
-def test_planners_and_variants_have_ledgers():
+def test_ledger_works_for_planning_policies_and_variants():
     """A planner gains 7 at each throw, on the futures that it draws."""
     planner = {"player_0": RolloutPolicy([2, 9], futures=2, horizon=1)}
     variant = Variant("dice", Dice, points=dice())
@@ -192,7 +194,7 @@ def test_ledger_does_not_repeat_warnings_in_its_copies(recwarn):
     assert [str(warning.message) for warning in recwarn] == ["loud"] * 3
 
 
-def test_ledger_returns_match_the_plain_episode():
+def test_ledger_returns_match_an_episode_without_ledger():
     for futures in (0, 2):
         found = ledger(Fair, FAIR_POLICIES, seeds=[4], points=FAIR_POINTS, futures=futures)
         assert found.returns[4] == pytest.approx(returns_of(Fair, FAIR_POINTS, FAIR_POLICIES, 4))
@@ -248,7 +250,7 @@ def test_ledger_separates_skill_from_luck():
 
 @given(seed=seeds)
 @examples(4)
-def test_value_skill_and_luck_add_up_to_the_return(seed):
+def test_ledger_value_skill_and_luck_add_up_to_the_return(seed):
     found = ledger(Fair, FAIR_POLICIES, seeds=[seed], points=FAIR_POINTS, futures=3)
     if len(found.frame):
         sums = found.frame[["skill", "luck"]].sum().sum()
@@ -260,7 +262,7 @@ def test_value_skill_and_luck_add_up_to_the_return(seed):
     assert total.tolist() == pytest.approx([found.returns[seed]] * len(once))
 
 
-def test_deterministic_simulation_attributes_all_to_skill():
+def test_ledger_of_a_deterministic_simulation_has_no_luck():
     class Fixed(Dice):
         deterministic = True
 
@@ -319,7 +321,7 @@ def test_ledger_frame_describes_box_actions_and_rule_decisions():
     assert frame["contribution"].tolist()[2:] == [0.0, 0.0]
 
 
-def test_without_a_decision_the_frame_is_empty():
+def test_ledger_frame_of_an_agent_without_decisions_is_empty():
     simulation = Script(lambda simulation: None)
     found = ledger(simulation, {"player_0": lambda seen: 0}, seeds=[1], points=dice())
     assert list(found.frame.columns) == COLUMNS
@@ -327,7 +329,7 @@ def test_without_a_decision_the_frame_is_empty():
     assert len(found.summary()) == 0
 
 
-def test_a_sample_has_some_of_the_decisions():
+def test_ledger_sample_has_some_of_the_decisions():
     given = {"seeds": range(4), "points": FAIR_POINTS, "futures": 2, "method": "replay"}
     whole = ledger(Fair, FAIR_POLICIES, **given).frame
     some = ledger(Fair, FAIR_POLICIES, **given, sample=0.3).frame
@@ -340,7 +342,7 @@ def test_a_sample_has_some_of_the_decisions():
         assert both[name].tolist() == both[f"{name}_whole"].tolist()
 
 
-def test_the_plot_marks_ten_decisions():
+def test_ledger_plot_marks_ten_decisions():
     found = ledger(Fair, FAIR_POLICIES, seeds=range(3), points=FAIR_POINTS)
     axes = found.plot().axes[0]
     words = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -396,7 +398,7 @@ def test_ledger_refuses_invalid_arguments():
 # -- decision values ------------------------------------------------------------------------------
 
 
-def test_each_legal_action_has_a_value():
+def test_decision_values_has_a_row_for_each_legal_action():
     found = decision_values(
         Dice, seeds=[1, 2], points=dice(), futures=4, describe=describe, method="replay"
     )
@@ -415,7 +417,7 @@ def test_each_legal_action_has_a_value():
 
 
 @pytest.mark.thorough
-def test_masked_actions_have_no_row_and_policies_play():
+def test_decision_values_has_no_row_for_masked_actions():
     warden = {"warden_0": boldest}
     found = decision_values(Fair, warden, seeds=[1, 3], points=FAIR_POINTS, futures=2)
     assert set(found["agent"]) == {"warden_0"}
@@ -426,7 +428,7 @@ def test_masked_actions_have_no_row_and_policies_play():
     assert exact["error"].tolist() == [0.0] * len(exact)
 
 
-def test_a_horizon_counts_decisions_of_the_agent():
+def test_decision_values_horizon_counts_decisions_of_the_agent():
     class Later(Dice):
         """A high number pays at once, and costs more at the second decision after it."""
 
@@ -448,7 +450,7 @@ def test_a_horizon_counts_decisions_of_the_agent():
     assert best.tolist()[:4] == [0] * 4
 
 
-def test_values_of_a_metric_are_read_at_the_horizon():
+def test_decision_values_metric_is_read_at_the_horizon():
     totals = decision_values(
         Dice, seeds=[1], points=dice(), futures=0, horizon=1, metric=lambda dice: dice.last
     )
@@ -456,7 +458,7 @@ def test_values_of_a_metric_are_read_at_the_horizon():
     assert np.diff(first).tolist() == pytest.approx([1.0] * 9)
 
 
-def test_actions_that_cannot_be_listed_are_refused():
+def test_decision_values_refuses_actions_that_cannot_be_listed():
     with pytest.raises(OptionValueError, match="Discrete"):
         decision_values(GreenhouseSim, seeds=[1])
     with pytest.raises(OptionValueError, match="horizon must be"):

@@ -51,7 +51,7 @@ def lines(store):
     return [json.loads(line) for line in whole]
 
 
-def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_path):
+def test_run_experiment_returns_a_tidy_table_and_stores_provenance(tmp_path):
     frame, known = run(tmp_path), lines(tmp_path)
     factors, outcome = ["days", "price", "kind"], ["status", "error"]
     assert list(frame.columns) == [
@@ -109,7 +109,7 @@ def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_pa
     ],
     ids=str,
 )
-def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
+def test_run_experiment_table_is_the_same_with_workers_and_batches(arguments, tmp_path, capsys):
     if arguments.get("batched"):
         arguments = {
             "contenders": {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}},
@@ -137,7 +137,7 @@ def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
         Variant("v", Shop),
     ],
 )
-def test_classes_factories_and_variants_make_simulations(make, tmp_path):
+def test_run_experiment_takes_classes_factories_and_variants(make, tmp_path):
     assert run(tmp_path / "a", make=make).equals(run(tmp_path / "b"))
 
 
@@ -146,7 +146,7 @@ def test_classes_factories_and_variants_make_simulations(make, tmp_path):
 )
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
 @pytest.mark.parametrize("method", ["run", "close"])
-def test_exits_and_errors_that_end_a_run_become_its_error_row(method, error, arguments, tmp_path):
+def test_run_experiment_turns_exits_and_errors_into_error_rows(method, error, arguments, tmp_path):
     def end(shop):
         getattr(Shop, method, lambda shop: None)(shop)
         if shop.seed == 1:
@@ -160,7 +160,7 @@ def test_exits_and_errors_that_end_a_run_become_its_error_row(method, error, arg
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_an_interrupt_ends_the_experiment(batched, tmp_path):
+def test_run_experiment_ends_at_a_keyboard_interrupt(batched, tmp_path):
     class Interrupted(Shop):
         def run(self):
             if self.seed == 2:
@@ -179,7 +179,7 @@ def test_an_interrupt_ends_the_experiment(batched, tmp_path):
     assert [line["seed"] for line in lines(tmp_path)] == [0, 1]
 
 
-def test_points_and_plugins_may_be_iterators(tmp_path):
+def test_run_experiment_takes_iterators_of_points_and_plugins(tmp_path):
     class Own(Shop):
         points = POINTS
 
@@ -191,7 +191,7 @@ def test_points_and_plugins_may_be_iterators(tmp_path):
     assert run(tmp_path / "b", points=iter(points), plugins=iter(plugins), **given).equals(expected)
 
 
-def test_stored_runs_are_not_run_again(tmp_path):
+def test_run_experiment_does_not_repeat_stored_runs(tmp_path):
     calls = []
 
     def make(days):
@@ -237,7 +237,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
         {"status": "ok", "metrics": None, "provenance": None},
     ],
 )
-def test_run_of_a_damaged_line_is_run_again(damage, tmp_path):
+def test_run_experiment_repeats_the_run_of_a_damaged_line(damage, tmp_path):
     def again():
         return run(tmp_path, {"days": [1]}, seeds=range(2), contenders=None)
 
@@ -252,7 +252,7 @@ def test_run_of_a_damaged_line_is_run_again(damage, tmp_path):
         assert again().equals(first)
 
 
-def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
+def test_run_experiment_repeats_failed_runs_on_request(tmp_path):
     attempt = 0
 
     def make(days):
@@ -271,7 +271,7 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
     assert again()["status"].tolist() == ["ok"] * 3
 
 
-def test_factors_and_metrics_keep_their_types_in_the_store(tmp_path):
+def test_run_experiment_store_keeps_types_of_factors_and_metrics(tmp_path):
     things = [1, 1.0, True, "1", "\u00e9\n", None, math.inf, -0.0, 0.1, 2**70]
     design = pd.DataFrame({"kind": pd.Series(things, dtype=object)})
     frame = run(tmp_path, design, contenders=None, seeds=[0], metric=lambda shop: shop.kind)
@@ -300,13 +300,13 @@ def test_factors_and_metrics_keep_their_types_in_the_store(tmp_path):
         ("team", {"team": 3}),
     ],
 )
-def test_invalid_arguments_are_refused_before_anything_is_stored(match, arguments, tmp_path):
+def test_run_experiment_refuses_invalid_arguments_before_it_stores(match, arguments, tmp_path):
     with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
         run(tmp_path / "store", **arguments)
     assert not (tmp_path / "store").exists()
 
 
-def test_a_store_of_another_experiment_is_refused(tmp_path):
+def test_run_experiment_refuses_the_store_of_another_experiment(tmp_path):
     run(tmp_path)
     for match, arguments in (
         ("its factors are", {"design": DESIGN[["days"]]}),
@@ -329,7 +329,7 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
         run(other)
 
 
-def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch):
+def test_run_experiment_joins_a_store_that_another_process_makes(tmp_path, monkeypatch):
     real = Path.iterdir
 
     def iterdir(path):
@@ -359,7 +359,7 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
         (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
     ],
 )
-def test_stored_runs_of_other_definitions_are_warned_of(told, arguments, tmp_path):
+def test_run_experiment_warns_if_stored_runs_had_other_definitions(told, arguments, tmp_path):
     contenders = {"contenders": {"much": {"keeper": much}}}
     first = run(tmp_path, **contenders)
     more = pd.concat([DESIGN[:1].assign(days=7), DESIGN])  # of whose first row nothing is stored
@@ -369,7 +369,7 @@ def test_stored_runs_of_other_definitions_are_warned_of(told, arguments, tmp_pat
         assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
-def test_stored_failed_run_does_not_block_other_runs(tmp_path):
+def test_run_experiment_continues_despite_a_stored_failed_run(tmp_path):
     def make(days):
         return Variant("v", Shop, parameters={"days": days} if days != 2 else {"nights": days})
 
@@ -380,7 +380,7 @@ def test_stored_failed_run_does_not_block_other_runs(tmp_path):
     assert frame.groupby("days")["status"].first().to_dict() == {2: "error", 3: "ok"}
 
 
-def test_stored_runs_of_equal_definitions_cause_no_warning(tmp_path):
+def test_run_experiment_does_not_warn_if_stored_definitions_are_equal(tmp_path):
     class Policy:
         def __call__(self, observation):
             return 1
@@ -393,7 +393,7 @@ def test_stored_runs_of_equal_definitions_cause_no_warning(tmp_path):
     ).equals(first)
 
 
-def test_another_version_of_a_package_is_warned_of(tmp_path):
+def test_run_experiment_warns_of_another_version_of_a_package(tmp_path):
     first = run(tmp_path)
     (path,) = tmp_path.glob("*.jsonl")
     path.write_bytes(
@@ -404,7 +404,7 @@ def test_another_version_of_a_package_is_warned_of(tmp_path):
 
 
 @pytest.mark.parametrize(("batched", "cut"), [(False, 1), (True, 20), (True, 700)])
-def test_a_full_disk_is_an_error_and_only_the_torn_run_is_run_again(
+def test_run_experiment_repeats_only_the_torn_run_after_a_full_disk(
     batched, cut, tmp_path, monkeypatch
 ):
     def open_full(path, *args, **kwargs):
@@ -429,7 +429,7 @@ def test_a_full_disk_is_an_error_and_only_the_torn_run_is_run_again(
     assert run(tmp_path / "full", contenders=None).equals(run(tmp_path / "whole", contenders=None))
 
 
-def test_a_store_that_cannot_be_written_or_read_is_an_error(tmp_path):
+def test_run_experiment_raises_an_error_for_an_unusable_store(tmp_path):
     (tmp_path / "file").write_text("")
     for store in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(
@@ -444,7 +444,7 @@ def test_a_store_that_cannot_be_written_or_read_is_an_error(tmp_path):
         run(None)
 
 
-def test_relative_store_is_in_the_working_directory_of_the_user(tmp_path, monkeypatch):
+def test_run_experiment_store_is_relative_to_the_users_directory(tmp_path, monkeypatch):
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)  # where workers that were started before are not
@@ -452,7 +452,7 @@ def test_relative_store_is_in_the_working_directory_of_the_user(tmp_path, monkey
         assert len(lines(tmp_path / name / "new" / "store")) == 12
 
 
-def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
+def test_run_experiment_threads_write_files_of_their_own(tmp_path):
     with joblib.parallel_config(backend="threading"):
         frame = run(
             tmp_path / "shared", workers=2, make=lambda **row: Shop(**row | {"kind": "slow"})
@@ -475,7 +475,7 @@ def visits(days=2):
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents")
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
-def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_path):
+def test_run_experiment_reports_a_misnamed_agent_for_its_contender(arguments, tmp_path):
     policy = much_of_many if arguments.get("batched") else much
     given = {"seeds": range(3), "points": beings(), **arguments}
     told = (
@@ -504,7 +504,7 @@ def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_pa
 
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
-def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path):
+def test_run_experiment_keeps_definitions_of_each_row_separate(arguments, tmp_path):
     def make(scale):
         """Return the same object for all rows, whose points are replaced."""
         for point, definition in POINTS.items():
@@ -519,7 +519,7 @@ def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path)
     assert frame["metric"].tolist() == 2 * alone
 
 
-def test_process_is_reused_only_with_same_environment_and_directory(tmp_path, monkeypatch):
+def test_run_experiment_reuses_a_simulators_process_only_in_its_directory(tmp_path, monkeypatch):
     def make(name, folder):
         (tmp_path / folder).mkdir(exist_ok=True)
         monkeypatch.setenv("HARBOUR", name)
@@ -542,7 +542,7 @@ class Deadly(Shop):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("batched", [False, True])
-def test_run_that_kills_its_worker_becomes_an_error_row(batched, tmp_path):
+def test_run_experiment_turns_a_dead_workers_run_into_an_error_row(batched, tmp_path):
     given = {"design": {"days": [1, 2, 3]}, "contenders": None, "batched": batched}
     frame = run(tmp_path / "a", make=Deadly, workers=2, **given)
     whole = run(tmp_path / "b", **given)
@@ -554,7 +554,7 @@ def test_run_that_kills_its_worker_becomes_an_error_row(batched, tmp_path):
     assert run(tmp_path / "a", make=Deadly, workers=2, **given).equals(frame)
 
 
-def test_a_backend_that_hides_the_death_of_workers_is_refused_at_once(
+def test_run_experiment_refuses_backends_that_hide_dead_workers(
     tmp_path,
 ):
     with joblib.parallel_config(backend="multiprocessing"):
@@ -565,7 +565,7 @@ def test_a_backend_that_hides_the_death_of_workers_is_refused_at_once(
     assert not (tmp_path / "store").exists()
 
 
-def test_integers_with_too_many_digits_for_json_are_errors(tmp_path):
+def test_run_experiment_marks_integers_too_long_for_json_as_errors(tmp_path):
     frame = run(tmp_path / "metric", {"days": [1]}, metric=lambda shop: 10**5000)
     assert frame["error"].str.contains("cannot be stored as JSON").all()
     with pytest.raises(OptionValueError, match="cannot be stored as JSON"):
@@ -614,7 +614,7 @@ SCRIPT = """
 @pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_killed_process_loses_only_the_runs_in_progress(workers, tmp_path):
+def test_run_experiment_killed_loses_only_the_runs_in_progress(workers, tmp_path):
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
 

@@ -76,13 +76,13 @@ BET = {f"{__name__}.Casino.bet": define(agent="gambler", reward_mapping=lambda g
 
 @pytest.mark.parametrize("kind", [Casino, NumpyCasino, BusyCasino])
 @pytest.mark.parametrize("arguments", [{}, {"batched": True}, {"workers": 2}], ids=str)
-def test_unseeded_draws_from_global_generators_are_errors(kind, arguments):
+def test_evaluate_marks_unseeded_draws_from_global_generators_as_errors(kind, arguments):
     assert_errors(fates(kind, BET, **arguments), "global_rng=True")
     assert fates(kind, BET, global_rng=True, **arguments) == FINE
 
 
 @pytest.mark.parametrize("kind", [SeededCasino, SeededNumpyCasino])
-def test_draws_after_seeding_are_errors_only_if_runs_are_interleaved(kind):
+def test_evaluate_marks_global_seeding_as_error_if_runs_are_batched(kind):
     assert fates(kind, BET) == FINE
     assert_errors(fates(kind, BET, batched=True), "influence each other")
     assert fates(kind, BET, batched=True, batch_size=1) == FINE
@@ -110,7 +110,7 @@ def grazing(**changes):
     return {f"{__name__}.Animal.graze": define(agent="animal", **changes)}
 
 
-def test_rewards_that_freed_arguments_made_zero_are_errors():
+def test_evaluate_marks_rewards_lost_with_freed_entities_as_errors():
     found = fates(Herd, grazing(reward_mapping=lambda animal: animal.food))
     assert_errors(found, "the reward is 0.0")
     observe = {"observation_space_mapping": lambda animal: [animal.food, 0.0]}
@@ -118,7 +118,7 @@ def test_rewards_that_freed_arguments_made_zero_are_errors():
     assert fates(Herd, unpaid) == FINE
 
 
-def test_rewards_that_objects_mix_are_errors():
+def test_evaluate_marks_rewards_mixed_by_two_objects_as_errors():
     class Pair:
         def reset(self, seed):
             self.animals = [Animal(), Animal()]
@@ -146,13 +146,13 @@ def stubborn(decide):
     return lambda: Script(main)
 
 
-def test_runs_of_simulations_that_refuse_to_unwind_are_errors():
+def test_evaluate_marks_models_that_do_not_unwind_as_errors():
     decide = decision(agent="chooser")
     found = fates(stubborn(decide), decide, max_steps=2, metric=lambda script: len(script.log))
     assert_errors(found, "refuses to end")
 
 
-def test_the_summary_tells_of_errors_and_has_no_number():
+def test_evaluate_summary_shows_errors_instead_of_numbers():
     class Moody(Casino):
         def reset(self, seed):
             self.stakes = self.draw() if seed == 1 else float(seed)
@@ -170,7 +170,7 @@ def test_the_summary_tells_of_errors_and_has_no_number():
     found.plot()
 
 
-def test_experiments_store_the_error_of_each_run(tmp_path):
+def test_run_experiment_stores_the_error_of_each_run(tmp_path):
     for _ in range(2):
         table = run_experiment(Casino, [{}, {}], seeds=SEEDS, points=BET, store=tmp_path)
         assert set(table["status"]) == {"error"}
@@ -181,7 +181,7 @@ def test_experiments_store_the_error_of_each_run(tmp_path):
     assert set(table["status"]) == {"ok"}
 
 
-def test_the_warning_itself_comes_once():
+def test_evaluate_warns_once_of_global_generators():
     class Fresh(Casino):
         pass
 
@@ -193,7 +193,7 @@ def test_the_warning_itself_comes_once():
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_trajectories_mark_episodes_with_wrong_numbers(workers):
+def test_collect_episodes_marks_episodes_with_wrong_numbers(workers):
     policies = {"gambler": RULE}
     for _ in range(2):
         found = collect_episodes(Casino, policies, seeds=SEEDS, points=BET, workers=workers)

@@ -100,7 +100,9 @@ RUNS = {
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", ["fork", "replay"])
 @pytest.mark.parametrize("run", RUNS)
-def test_a_branch_in_a_planner_is_saved_and_goes_on(run, method, at_third, tmp_path):
+def test_save_episode_in_a_planning_policys_branch_can_be_continued(
+    run, method, at_third, tmp_path
+):
     if (run, method) == ("thread", "fork"):
         pytest.skip("threads are not forked")
     path = tmp_path / "branch"
@@ -114,7 +116,7 @@ def test_a_branch_in_a_planner_is_saved_and_goes_on(run, method, at_third, tmp_p
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_a_clone_in_a_planner_is_saved(method, at_third, tmp_path):
+def test_save_episode_works_for_a_clone_in_a_planning_policy(method, at_third, tmp_path):
     def use(env):
         twin = clone(env, method=method)
         save_episode(twin, tmp_path / "at once")
@@ -132,7 +134,7 @@ def test_a_clone_in_a_planner_is_saved(method, at_third, tmp_path):
     assert future(loaded) == told
 
 
-def test_a_branch_of_a_recorded_environment_is_saved(at_third, tmp_path):
+def test_save_episode_works_for_a_branch_of_a_recorded_env(at_third, tmp_path):
     run = play(aec_env, record=tmp_path / "all")
     save = partial(step, path=tmp_path / "branch")
     [told] = at_third(lambda env: branch(env, save), run)
@@ -140,7 +142,7 @@ def test_a_branch_of_a_recorded_environment_is_saved(at_third, tmp_path):
     assert future(load_episode(tmp_path / "branch")) == told
 
 
-def test_a_branch_is_not_saved_as_the_file_of_its_parent(tmp_path):
+def test_save_episode_in_a_branch_does_not_overwrite_the_parents_file(tmp_path):
     env = aec_env(Pumps, record=tmp_path / "all")
     env.reset(seed=1)
 
@@ -154,7 +156,7 @@ def test_a_branch_is_not_saved_as_the_file_of_its_parent(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:Pumps cannot draw")
-def test_a_branch_with_another_base_is_refused(at_third, tmp_path):
+def test_save_episode_refuses_a_branch_with_other_base_policies(at_third, tmp_path):
     def value(env):
         save_episode(env, tmp_path / "a")
         return 0.0
@@ -175,7 +177,7 @@ def test_a_branch_with_another_base_is_refused(at_third, tmp_path):
     assert at_third(use, RUNS["aec"])
 
 
-def test_a_branch_beside_other_simulations_is_refused(at_third, tmp_path):
+def test_save_episode_refuses_a_branch_of_a_vector_env(at_third, tmp_path):
     def run():
         env = vector_env(Pumps, num_envs=1, agent="push", policies={"pull": explore})
         env.reset(seed=3)
@@ -192,13 +194,13 @@ def test_a_branch_beside_other_simulations_is_refused(at_third, tmp_path):
     assert at_third(use, lambda: simulate_many(Pumps, {"pull": explore}, seeds=[3]))
 
 
-def test_open_game_refuses_the_file_of_a_branch(at_third, tmp_path):
+def test_play_refuses_to_open_the_episode_file_of_a_branch(at_third, tmp_path):
     at_third(lambda env: branch(env, partial(step, path=tmp_path / "a")), RUNS["aec"])
     with pytest.raises(EpisodeFileError, match="branch of a planner"):
         open_game(tmp_path / "a", None, Rules(""))
 
 
-def test_a_file_of_a_branch_is_shown_up_to_its_decisions(at_third, tmp_path):
+def test_replay_command_shows_a_branchs_file_up_to_its_decisions(at_third, tmp_path):
     at_third(lambda env: branch(env, partial(step, path=tmp_path / "a")), RUNS["simulate"])
     target.update(seen=[])
     head, *decisions, now = replay_episode(tmp_path / "a").splitlines()

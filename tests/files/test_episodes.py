@@ -2,7 +2,6 @@
 
 import json
 import os
-from functools import partial
 
 import numpy as np
 import pytest
@@ -33,19 +32,7 @@ from simenv_marl.planning import RolloutPolicy
 from tests.processes import python
 from tests.worlds import saved
 from tests.worlds.random_worlds import YARD_POINTS, yard_outcome
-from tests.worlds.saved import Pumps, differing, future, move, steady, yard
-
-YARD = partial(yard, 3, 2, 2, 2, 3, None)
-
-
-def begun(make=aec_env, simulation=YARD, points=YARD_POINTS, *, taken=6, seed=7, **options):
-    """Return an environment after some steps."""
-    env = make(simulation, points, **options)
-    env.reset(seed=seed)
-    chance = saved.random.Random(1)
-    for _ in range(taken):
-        move(env, chance)
-    return env
+from tests.worlds.saved import YARD, Pumps, differing, future, mid_episode, steady
 
 
 def lines_of(path):
@@ -57,14 +44,19 @@ def lines_of(path):
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
-def test_random_worlds_continue_alike_in_a_fresh_process():
+def test_saved_episodes_of_random_models_continue_alike_in_a_fresh_process():
     assert differing(80) == []
+
+
+@pytest.mark.parametrize("kind", ["saved", "branches"])
+def test_command_of_saved_worlds_prints_how_many_continuations_differ(kind):
+    assert python("-m", "tests.worlds.saved", 1, kind).stdout.startswith("0 of ")
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, turn_env])
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_a_clone_is_saved_like_its_original(make, method, tmp_path):
-    env = begun(make)
+def test_save_episode_of_a_clone_equals_that_of_its_original(make, method, tmp_path):
+    env = mid_episode(make)
     with_seed = clone(env, method=method)
     for path, each in ((tmp_path / "env", env), (tmp_path / "clone", with_seed)):
         save_episode(each, path)
@@ -81,8 +73,8 @@ class Reseeded(Pumps):
         reseed_generators(self, seed)
 
 
-def test_a_reseeded_clone_is_saved_with_its_seed(tmp_path):
-    env = begun(single_env, Reseeded, agent="push", taken=3, points=None)
+def test_save_episode_of_a_reseeded_clone_keeps_its_seed(tmp_path):
+    env = mid_episode(single_env, Reseeded, agent="push", taken=3, points=None)
     other = clone(env, seed=5)
     other.step(RULE)
     save_episode(other, tmp_path / "a")
@@ -90,8 +82,8 @@ def test_a_reseeded_clone_is_saved_with_its_seed(tmp_path):
     assert future(load_episode(tmp_path / "a"), 1) == future(other, 1)
 
 
-def test_branch_can_be_saved_as_an_episode_file(tmp_path):
-    env = begun()
+def test_save_episode_works_in_a_branch(tmp_path):
+    env = mid_episode()
 
     def save(continuation, number):
         continuation.step(RULE)
@@ -102,8 +94,8 @@ def test_branch_can_be_saved_as_an_episode_file(tmp_path):
     assert repr(load_episode(tmp_path / "branch").last()) == told
 
 
-def test_policies_of_a_loaded_file_answer_later_decisions_too(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", policies={"pull": steady})
+def test_load_episode_restores_policies_for_later_decisions(tmp_path):
+    env = mid_episode(single_env, Pumps, points=None, agent="push", policies={"pull": steady})
     save_episode(env, tmp_path / "a")
     assert [line.get("by") for line in lines_of(tmp_path / "a")[1:4]] == [None, "policy", None]
     loaded = load_episode(tmp_path / "a")
@@ -111,7 +103,7 @@ def test_policies_of_a_loaded_file_answer_later_decisions_too(tmp_path):
     assert future(loaded, 2) == future(env, 2)
 
 
-def test_the_steps_of_ended_agents_are_in_the_file(tmp_path):
+def test_episode_file_contains_the_steps_of_ended_agents(tmp_path):
     env = aec_env(Pumps, max_steps=3)
     env.reset(seed=1)
     for _ in range(3):
@@ -127,7 +119,7 @@ def test_the_steps_of_ended_agents_are_in_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("make", [single_env, joint_env, turn_env, parallel_env])
-def test_latest_is_the_result_of_the_last_reset_or_step(make, tmp_path):
+def test_env_latest_is_the_result_of_the_last_reset_or_step(make, tmp_path):
     options = {"agent": "push"} if make is single_env else {}
     env = make(Pumps, **options)
     with pytest.raises(NotResetError):
@@ -145,7 +137,7 @@ def test_latest_is_the_result_of_the_last_reset_or_step(make, tmp_path):
 
 
 def test_episode_files_store_plugins_by_name(tmp_path):
-    env = begun(plugins=[(twice, f"{POINTS_OF}.Yard.plan", "after")])
+    env = mid_episode(plugins=[(twice, f"{POINTS_OF}.Yard.plan", "after")])
     save_episode(env, tmp_path / "a")
     loaded = load_episode(tmp_path / "a")
     assert loaded.unwrapped.plugins == env.unwrapped.plugins
@@ -160,7 +152,7 @@ def twice(yard, _result):
 
 
 def test_episode_files_store_float32_actions_exactly(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", taken=0)
+    env = mid_episode(single_env, Pumps, points=None, agent="push", taken=0)
     env.step(np.array([0.1, -1 / 3], np.float32))
     env.step(np.array([1, 0], np.float32))
     save_episode(env, tmp_path / "a")
@@ -170,7 +162,7 @@ def test_episode_files_store_float32_actions_exactly(tmp_path):
 
 
 def test_episode_file_is_small(tmp_path):
-    env = begun(taken=0)
+    env = mid_episode(taken=0)
     for _ in range(30):
         env.step(None if env.terminations[env.agent_selection] else 3)
     save_episode(env, tmp_path / "a")
@@ -190,7 +182,9 @@ def test_episode_file_is_small(tmp_path):
         ({"plugins": [(lambda *_, **__: None, f"{POINTS_OF}.Yard.plan", "before")]}, "plugins="),
     ],
 )
-def test_parts_without_a_name_are_refused_or_left_open(options, culprit, tmp_path):
+def test_save_episode_refuses_unnamed_objects_unless_they_are_given_later(
+    options, culprit, tmp_path
+):
     env = aec_env(YARD, YARD_POINTS, **options)
     env.reset(seed=1)
     with pytest.raises(EpisodeFileError, match=f"no dotted name.*{culprit}"):
@@ -202,10 +196,10 @@ def test_parts_without_a_name_are_refused_or_left_open(options, culprit, tmp_pat
     assert repr(load_episode(tmp_path / "a", **options).last()) == repr(env.last())
 
 
-def test_simulations_and_points_without_a_name_are_given_at_loading(tmp_path):
+def test_load_episode_takes_simulations_and_points_without_a_name(tmp_path):
     points = {name: YARD_POINTS[name] for name in YARD_POINTS}
-    made = saved.Yard(saved.Design(3, 2, 2, 2, 3, None))
-    env = begun(simulation=made, points=points)
+    made = saved.Yard(saved.YardDesign(3, 2, 2, 2, 3, None))
+    env = mid_episode(simulation=made, points=points)
     with pytest.raises(EpisodeFileError, match="the simulation: <"):
         save_episode(env, tmp_path / "a")
     save_episode(env, tmp_path / "a", unnamed=True)
@@ -214,9 +208,9 @@ def test_simulations_and_points_without_a_name_are_given_at_loading(tmp_path):
     assert future(load_episode(tmp_path / "a", simulation=made), 3) == future(env, 3)
 
 
-def test_a_definition_that_no_module_holds_is_refused(tmp_path):
+def test_save_episode_refuses_a_definition_that_no_module_contains(tmp_path):
     points = {name: saved.define_again() for name in list(YARD_POINTS)[:1]}
-    env = begun(points=points, taken=1)
+    env = mid_episode(points=points, taken=1)
     with pytest.raises(EpisodeFileError, match=r"the definition of .*Yard\.plan"):
         save_episode(env, tmp_path / "a")
     save_episode(env, tmp_path / "a", unnamed=True)
@@ -225,7 +219,7 @@ def test_a_definition_that_no_module_holds_is_refused(tmp_path):
     assert load_episode(tmp_path / "a", points=points).agent_selection == "planner"
 
 
-def test_save_refuses_environments_without_one_episode_of_their_own(tmp_path):
+def test_save_episode_refuses_envs_without_a_single_episode(tmp_path):
     with pytest.raises(NotResetError):
         save_episode(aec_env(YARD, YARD_POINTS), tmp_path / "a")
     env = vector_env(Pumps, num_envs=1)
@@ -241,7 +235,7 @@ def test_save_refuses_environments_without_one_episode_of_their_own(tmp_path):
             found.append(error)
         return 1
 
-    begun(policies={"planner": plan}, taken=1)
+    mid_episode(policies={"planner": plan}, taken=1)
     assert found
 
 
@@ -256,23 +250,23 @@ class Forgetful(Pumps):
         self.level += self.made
 
 
-def test_a_simulation_that_does_not_repeat_itself_is_not_saved(tmp_path):
-    env = begun(simulation=Forgetful, points=None)
+def test_save_episode_refuses_a_model_that_does_not_repeat_itself(tmp_path):
+    env = mid_episode(simulation=Forgetful, points=None)
     with pytest.raises(EpisodeFileError, match="does not repeat the episode"):
         save_episode(env, tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_reset_options_that_are_no_data_are_refused(tmp_path):
+def test_save_episode_refuses_reset_options_that_are_no_json(tmp_path):
     env = aec_env(Pumps)
     env.reset(seed=1, options={"level": [0, 0], "other": object()})
     with pytest.raises(EpisodeFileError, match="cannot be written as JSON"):
         save_episode(env, tmp_path / "a")
 
 
-def test_files_that_cannot_be_opened_are_named(tmp_path):
+def test_episode_file_errors_name_files_that_cannot_be_opened(tmp_path):
     with pytest.raises(StoreError, match="nowhere"):
-        save_episode(begun(), tmp_path / "nowhere" / "a")
+        save_episode(mid_episode(), tmp_path / "nowhere" / "a")
     with pytest.raises(StoreError, match="nowhere"):
         load_episode(tmp_path / "nowhere")
 
@@ -303,31 +297,33 @@ def changed(path, number, change):
         ),
     ],
 )
-def test_the_first_decision_that_differs_is_named(number, change, problem, tmp_path):
-    save_episode(begun(), tmp_path / "a")
+def test_load_episode_error_names_the_first_decision_that_differs(
+    number, change, problem, tmp_path
+):
+    save_episode(mid_episode(), tmp_path / "a")
     changed(tmp_path / "a", number, lambda line: line.update(change))
     with pytest.raises(EpisodeFileError, match=problem) as caught:
         load_episode(tmp_path / "a")
     assert "Likely reasons: has the model changed?" in str(caught.value)
 
 
-def test_other_versions_are_named_as_the_reason(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+def test_load_episode_error_names_other_package_versions(tmp_path):
+    save_episode(mid_episode(), tmp_path / "a")
     changed(tmp_path / "a", 0, lambda line: line["versions"].update(numpy="1.0", lost="2.0"))
     changed(tmp_path / "a", 3, lambda line: line.update(seen=""))
     with pytest.raises(EpisodeFileError, match=r"numpy was 1\.0, and is .*; lost was 2\.0, and is"):
         load_episode(tmp_path / "a")
 
 
-def test_an_episode_that_ends_earlier_is_a_difference(tmp_path):
-    env = begun(single_env, Pumps, points=None, agent="push", taken=12)
+def test_load_episode_refuses_an_episode_that_ends_earlier_than_saved(tmp_path):
+    env = mid_episode(single_env, Pumps, points=None, agent="push", taken=12)
     save_episode(env, tmp_path / "a")
     with pytest.raises(EpisodeFileError, match=r"line 5.*the episode is over"):
         load_episode(tmp_path / "a", max_steps=3)
 
 
-def test_options_of_load_episode_replace_options_of_the_file(tmp_path):
-    save_episode(begun(driver="thread"), tmp_path / "a")
+def test_load_episode_options_replace_the_options_of_the_file(tmp_path):
+    save_episode(mid_episode(driver="thread"), tmp_path / "a")
     assert load_episode(tmp_path / "a").unwrapped.driver == "thread"
     assert load_episode(tmp_path / "a", driver="greenlet").unwrapped.driver == "greenlet"
 
@@ -357,7 +353,7 @@ def fail(**options):
     return env, error
 
 
-def test_after_an_error_the_file_leads_to_the_answer_before_it(tmp_path):
+def test_episode_file_after_an_error_leads_to_the_decision_before_it(tmp_path):
     env, error = fail()
     assert "save_episode(env, path)" in error.__notes__[0]
     save_episode(env, tmp_path / "a")
@@ -372,12 +368,12 @@ def test_after_an_error_the_file_leads_to_the_answer_before_it(tmp_path):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-def test_recorded_file_is_the_beginning_of_the_saved_file(make, tmp_path):
-    env = begun(make, Pumps, points=None, record=tmp_path / "all")
+def test_recorded_episode_file_is_the_beginning_of_the_saved_file(make, tmp_path):
+    env = mid_episode(make, Pumps, points=None, record=tmp_path / "all")
     save_episode(env, tmp_path / "saved")
     [path] = (tmp_path / "all").iterdir()
     grown = path.read_text()
-    other = begun(make, Pumps, points=None)
+    other = mid_episode(make, Pumps, points=None)
     save_episode(other, tmp_path / "other")
     assert (tmp_path / "saved").read_text() == (tmp_path / "other").read_text()
     assert (tmp_path / "other").read_text().startswith(grown)
@@ -385,7 +381,7 @@ def test_recorded_file_is_the_beginning_of_the_saved_file(make, tmp_path):
     assert list((tmp_path / "all").iterdir()) == []
 
 
-def test_a_file_stays_after_an_error_and_the_note_names_it(tmp_path):
+def test_record_keeps_the_file_of_a_failed_episode_and_the_error_names_it(tmp_path):
     env, error = fail(record=tmp_path)
     [path] = tmp_path.iterdir()
     assert f"the episode is in {path}" in error.__notes__[0]
@@ -399,7 +395,7 @@ def test_a_file_stays_after_an_error_and_the_note_names_it(tmp_path):
     assert "seen" in lines_of(path)[-1]
 
 
-def test_record_all_keeps_the_file_of_every_episode(tmp_path):
+def test_record_all_keeps_the_episode_file_of_every_episode(tmp_path):
     env = aec_env(Pumps, record=tmp_path, record_all=True)
     for seed in (1, 2):
         env.reset(seed=seed)
@@ -416,8 +412,8 @@ def test_record_all_keeps_the_file_of_every_episode(tmp_path):
     assert load_episode(paths[2]).agents == ["push", "pull"]
 
 
-def test_clones_and_branches_do_not_write_into_the_file(tmp_path):
-    env = begun(record=tmp_path)
+def test_clones_and_branches_do_not_write_into_the_recorded_file(tmp_path):
+    env = mid_episode(record=tmp_path)
     [path] = tmp_path.iterdir()
     before = path.read_text()
     for method in ("fork", "replay"):
@@ -429,7 +425,7 @@ def test_clones_and_branches_do_not_write_into_the_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_vector_environments_record_each_simulation(tmp_path):
+def test_vector_env_records_each_simulation(tmp_path):
     env = vector_env(Pumps, num_envs=2, view="joint", record=tmp_path)
     env.reset(seed=4)
     env.step(env.action_space.sample())
@@ -439,7 +435,7 @@ def test_vector_environments_record_each_simulation(tmp_path):
     env.close()
 
 
-def test_parts_without_a_name_are_refused_at_construction(tmp_path):
+def test_record_refuses_unnamed_objects_when_the_env_is_made(tmp_path):
     with pytest.raises(EpisodeFileError, match="no dotted name"):
         aec_env(lambda: YARD(), YARD_POINTS, record=tmp_path / "never")
     assert list(tmp_path.iterdir()) == []
@@ -447,31 +443,31 @@ def test_parts_without_a_name_are_refused_at_construction(tmp_path):
         aec_env(YARD, YARD_POINTS, record=3)
 
 
-def test_record_file_after_a_kill_can_be_loaded_and_continued(tmp_path):
+def test_recorded_file_of_a_killed_process_can_be_loaded_and_continued(tmp_path):
     code = f"""
 import os
-from tests.files.test_episodes import begun
-env = begun(record={str(tmp_path)!r}, taken=9)
+from tests.worlds.saved import mid_episode
+env = mid_episode(record={str(tmp_path)!r}, taken=9)
 os.kill(os.getpid(), 9)
 """
     python("-c", code, status=-9)
     [path] = tmp_path.iterdir()
-    env = begun(taken=9)
+    env = mid_episode(taken=9)
     assert future(load_episode(path), 3) == future(env, 3)
 
 
 @pytest.mark.parametrize("left", [1, 5, 40])
 def test_torn_last_line_of_an_episode_file_loses_one_decision(left, tmp_path):
-    env = begun(record=tmp_path, taken=9)
+    env = mid_episode(record=tmp_path, taken=9)
     [path] = tmp_path.iterdir()
     written = path.read_bytes()
     last = written.splitlines()[-1]
     env.close()
     path.write_bytes(written[: -len(last) + left - 1])
-    assert future(load_episode(path), 3) == future(begun(taken=8), 3)
+    assert future(load_episode(path), 3) == future(mid_episode(taken=8), 3)
 
 
-def test_a_kill_in_the_model_loads_before_an_answer_that_fails(tmp_path):
+def test_recorded_file_of_a_killed_model_loads_before_the_failing_step(tmp_path):
     _, _ = fail(record=tmp_path)
     [path] = tmp_path.iterdir()
     os.truncate(path, path.read_bytes().rstrip().rfind(b"\n") + 1)  # without the error
@@ -480,8 +476,8 @@ def test_a_kill_in_the_model_loads_before_an_answer_that_fails(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:yard cannot draw")
-def test_a_planner_branches_its_first_decision_and_is_saved(tmp_path):
-    env = begun(policies={"planner": PLANNER}, taken=2)
+def test_save_episode_works_with_a_planning_policy_that_branches(tmp_path):
+    env = mid_episode(policies={"planner": PLANNER}, taken=2)
     save_episode(env, tmp_path / "a")
     assert future(load_episode(tmp_path / "a"), 3) == future(env, 3)
 
@@ -490,22 +486,22 @@ PLANNER = RolloutPolicy([1, 2], futures=1, horizon=1, method="replay")
 
 
 @pytest.mark.filterwarnings("ignore:yard cannot draw")
-def test_planners_do_not_change_the_files_of_the_next_episodes(tmp_path):
-    env = begun(policies={"planner": PLANNER}, taken=2, record=tmp_path)
+def test_planning_policies_do_not_change_the_files_of_later_episodes(tmp_path):
+    env = mid_episode(policies={"planner": PLANNER}, taken=2, record=tmp_path)
     env.reset(seed=2)
     env.step(RULE)
     [path] = tmp_path.iterdir()
     assert repr(load_episode(path).last()) == repr(env.last())
 
 
-def test_points_in_another_order_than_the_simulations_keep_it(tmp_path):
+def test_episode_file_keeps_the_order_of_decision_points(tmp_path):
     env = turn_env(Pumps, list(Pumps.points)[::-1])
     observation, _ = env.reset(seed=1)
     save_episode(env, tmp_path / "a")
     assert repr(load_episode(tmp_path / "a").latest[0]) == repr(observation)
 
 
-def test_save_is_refused_while_a_step_or_reset_runs(tmp_path):
+def test_save_episode_refuses_an_env_in_a_running_step_or_reset(tmp_path):
     found = []
 
     def use(observation):
@@ -519,7 +515,7 @@ def test_save_is_refused_while_a_step_or_reset_runs(tmp_path):
     assert found
 
 
-def test_all_kept_files_are_saved_again(tmp_path):
+def test_save_episode_works_with_record_all(tmp_path):
     env = aec_env(Pumps, record=tmp_path / "all", record_all=True, max_steps=2)
     env.reset(seed=1)
     while env.agents:
@@ -529,8 +525,8 @@ def test_all_kept_files_are_saved_again(tmp_path):
     assert (loaded.agents, loaded.unwrapped.episode.truncated) == ([], True)
 
 
-def test_a_loaded_episode_is_recorded_again(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+def test_loaded_episode_is_recorded_again(tmp_path):
+    save_episode(mid_episode(), tmp_path / "a")
     loaded = load_episode(tmp_path / "a", record=tmp_path / "b")
     loaded.step(RULE)
     [path] = (tmp_path / "b").iterdir()
@@ -547,7 +543,7 @@ class Rare(Pumps):
             super().run()
 
 
-def test_seeds_without_a_decision_leave_no_file(tmp_path):
+def test_record_leaves_no_file_for_seeds_without_a_decision(tmp_path):
     env = single_env(Rare, agent="push", record=tmp_path, record_all=True)
     env.reset(seed=0)
     env.reset(seed=2)

@@ -24,7 +24,7 @@ class Bursts:
         raise OSError("the pipe has burst")
 
 
-def test_replay_shows_the_answer_that_led_to_an_error(tmp_path):
+def test_replay_command_shows_the_action_that_led_to_an_error(tmp_path):
     env = single_env(Bursts, [choose])
     env.reset(seed=1)
     env.step(4)

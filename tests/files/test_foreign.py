@@ -84,7 +84,7 @@ def go_on(folder, *given):
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_saved_environments_continue_in_a_fresh_process(name, tmp_path):
+def test_saved_episodes_of_example_envs_continue_in_a_fresh_process(name, tmp_path):
     module, _, attribute = name.rpartition(".")
     save(getattr(imported(module), attribute)(), tmp_path, name)
     alone(go_on, str(tmp_path))
@@ -93,7 +93,7 @@ def test_saved_environments_continue_in_a_fresh_process(name, tmp_path):
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", SIMULATIONS)
-def test_saved_simulations_continue_in_a_fresh_process(name, tmp_path):
+def test_saved_episodes_of_example_models_continue_in_a_fresh_process(name, tmp_path):
     module, attribute, views = SIMULATIONS[name]
     found = imported(module)
     for make in views:
@@ -102,7 +102,7 @@ def test_saved_simulations_continue_in_a_fresh_process(name, tmp_path):
     alone(go_on, str(tmp_path))
 
 
-def test_saved_simulations_with_arguments_continue_in_a_fresh_process(tmp_path):
+def test_saved_episodes_of_models_with_arguments_continue_in_a_new_process(tmp_path):
     sheep = imported("examples.wolf_sheep.env")
     meadow = partial(sheep.Meadow, 25, width=8, height=8, initial_sheep=20, initial_wolves=5)
     save(aec_env(meadow), tmp_path, "own points")
@@ -120,7 +120,7 @@ def process_of(name):
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", PROCESSES)
-def test_saved_models_outside_python_continue_in_a_fresh_process(name, tmp_path):
+def test_saved_episodes_of_models_outside_python_continue_in_a_new_process(name, tmp_path):
     problem = getattr(imported(PROCESSES[name][0]), "missing", str)()
     if problem:
         pytest.skip(problem)
@@ -144,7 +144,7 @@ def arguments_of(name):
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
-def test_saved_mesa_models_continue_in_a_fresh_process(tmp_path):
+def test_saved_episodes_of_mesa_models_continue_in_a_fresh_process(tmp_path):
     mesa_models = imported("examples.mesa_models")
     for example in mesa_models.EXAMPLES:
         name = example.__name__

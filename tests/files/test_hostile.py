@@ -10,8 +10,9 @@ import pytest
 from simenv_marl import load_episode, save_episode
 from simenv_marl.errors import EpisodeFileError, SimEnvError
 from simenv_marl.files.names import find, names_of
-from tests.files.test_episodes import begun, changed, lines_of
+from tests.files.test_episodes import changed, lines_of
 from tests.worlds import saved
+from tests.worlds.saved import mid_episode
 
 HERE = __name__
 touched = []
@@ -44,13 +45,13 @@ folder = subprocess
     "thing",
     [Holder, Holder.method, Holder.made, holder, named, method, unnamed, touched, saved.yard],
 )
-def test_module_level_objects_are_saved_by_name(thing):
+def test_episode_file_saves_module_level_objects_by_name(thing):
     name = names_of([thing])[id(thing)]
     assert find(name) == thing
 
 
 @pytest.mark.parametrize("thing", [Holder().method, lambda: 1, Holder(), partial(Holder)])
-def test_objects_that_no_module_holds_have_no_name(thing):
+def test_save_episode_finds_no_name_for_objects_that_no_module_contains(thing):
     assert names_of([thing]) == {}
 
 
@@ -79,14 +80,14 @@ def test_objects_that_no_module_holds_have_no_name(thing):
         ("simenv_marl.core.copies.packing.unpack", "another module"),
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(name, problem):
+def test_episode_file_with_a_name_of_another_object_is_refused(name, problem):
     with pytest.raises(EpisodeFileError, match=problem):
         find(name)
 
 
 @pytest.fixture
 def path(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+    save_episode(mid_episode(), tmp_path / "a")
     return tmp_path / "a"
 
 
@@ -104,7 +105,7 @@ def path(tmp_path):
         lambda name: {"points": [{"point": "a.b", "definition": name, "spaces": ""}]},
     ],
 )
-def test_names_in_every_place_are_checked(change, name, path):
+def test_episode_file_names_are_checked_in_every_field(change, name, path):
     changed(path, 0, lambda line: line.update(change(name)))
     with pytest.raises(EpisodeFileError, match="cannot be used"):
         load_episode(path)
@@ -131,7 +132,7 @@ def test_names_in_every_place_are_checked(change, name, path):
         {"versions": 3, "seed": 99},
     ],
 )
-def test_malformed_heads_are_errors(change, path):
+def test_episode_file_with_a_malformed_first_line_is_refused(change, path):
     changed(path, 0, lambda line: line.update(change))
     with pytest.raises(SimEnvError):
         load_episode(path)
@@ -158,7 +159,7 @@ def test_malformed_heads_are_errors(change, path):
         b'{"error": []}',
     ],
 )
-def test_malformed_lines_are_errors(line, path):
+def test_episode_file_with_a_malformed_line_is_refused(line, path):
     lines = path.read_bytes().splitlines()
     lines[3] = line
     path.write_bytes(b"\n".join(lines))
@@ -167,13 +168,13 @@ def test_malformed_lines_are_errors(line, path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"{}\n", b'{"episode": 1}\n', b"\x00" * 99])
-def test_files_without_an_episode_are_errors(content, tmp_path):
+def test_episode_file_without_an_episode_is_refused(content, tmp_path):
     (tmp_path / "a").write_bytes(content)
     with pytest.raises(EpisodeFileError):
         load_episode(tmp_path / "a")
 
 
-def test_refused_files_call_no_named_function(path):
+def test_episode_file_that_is_refused_calls_no_named_function(path):
     lines = lines_of(path)
     assert json.dumps(lines).count("pickle") == 0
     assert touched == []

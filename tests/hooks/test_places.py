@@ -74,7 +74,7 @@ def on_a_stack(test):
     ],
 )
 @on_a_stack
-def test_an_interceptor_gets_the_arguments_as_they_were_passed(function, args, kwargs):
+def test_decision_function_passes_on_arguments_as_they_were_passed(function, args, kwargs):
     hook = Hook(function, "somewhere.Model.function")
     made, other = hook.make_wrapper("one"), hook.make_wrapper("other")
     hook.enter(getcurrent(), lambda *given: given, None)
@@ -89,7 +89,7 @@ def test_an_interceptor_gets_the_arguments_as_they_were_passed(function, args, k
 
 
 @on_a_stack
-def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
+def test_pickled_decision_function_works_where_it_is_unpickled():
     scope = {"__name__": "__main__"}
     exec("def function(number): return number", scope)
     made = Hook(scope["function"], "__main__.function").make_wrapper("made with")
@@ -101,7 +101,7 @@ def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
     hook.leave(getcurrent())
 
 
-def test_outside_simulation_masks_the_interceptors_of_the_stack(monkeypatch):
+def test_outside_simulation_block_lets_decisions_follow_the_models_rule(monkeypatch):
     here, told = getcurrent(), []
     stack = SimpleNamespace(leave_hooks=told.append, enter_hooks=lambda: told.append("entered"))
 
@@ -123,13 +123,13 @@ def test_outside_simulation_masks_the_interceptors_of_the_stack(monkeypatch):
 # -- names -----------------------------------------------------------------------------------------
 
 
-def test_name_mangled_attributes_are_found_by_their_written_name():
+def test_decision_point_name_can_be_a_private_method_as_written():
     with handlers((lambda self: "taken", f"{__name__}._Hiding.__hidden", "instead")):
         assert _Hiding().look() == "taken"
     assert _Hiding().look() == "hidden"
 
 
-def test_error_in_an_imported_model_module_surfaces_unchanged(tmp_path, monkeypatch):
+def test_decision_point_name_raises_an_import_error_of_its_module(tmp_path, monkeypatch):
     (tmp_path / "broken_model.py").write_text("import no_such_package_at_all\n")
     (tmp_path / "raising_model.py").write_text("raise ZeroDivisionError\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -142,7 +142,7 @@ def test_error_in_an_imported_model_module_surfaces_unchanged(tmp_path, monkeypa
 # -- set and put back ------------------------------------------------------------------------------
 
 
-def test_function_is_found_under_its_attribute_name_in_the_module(monkeypatch):
+def test_decision_point_name_is_the_functions_attribute_in_its_module(monkeypatch):
     module, log = types.ModuleType("renaming_module"), []
     module.second = lambda: 1
     module.second.__module__ = module.__name__
@@ -156,7 +156,7 @@ def test_function_is_found_under_its_attribute_name_in_the_module(monkeypatch):
 @pytest.mark.parametrize(
     ("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)]
 )
-def test_a_patch_that_fails_half_way_is_undone(error, raised):
+def test_env_undoes_model_patches_that_fail_half_way(error, raised):
     class Refusing(type):
         def __setattr__(cls, name, value):
             if hook_of(value) is not None:
@@ -189,7 +189,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised):
 # -- nothing stays behind --------------------------------------------------------------------------
 
 
-def test_models_are_garbage_collected_with_their_points():
+def test_model_classes_are_garbage_collected_with_their_decision_points():
     references = []
     for _ in range(20):
 
@@ -226,7 +226,7 @@ def test_models_are_garbage_collected_with_their_points():
     assert name not in registered()
 
 
-def test_modules_may_be_imported_while_names_are_looked_up(monkeypatch):
+def test_decision_point_names_are_found_while_other_threads_import_modules(monkeypatch):
     class Lazy:
         """Stands in for a module that is imported as soon as something is asked of it."""
 
@@ -245,7 +245,7 @@ def test_modules_may_be_imported_while_names_are_looked_up(monkeypatch):
 
 @pytest.mark.parametrize("form", ["method", "static", "of a class", "inherited", "function"])
 @pytest.mark.parametrize("end", ["close", "drop"])
-def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, end):
+def test_env_keeps_patches_of_other_code_on_a_decision_point(form, end):
     name, call, expected = FORMS[form]
     owner, attribute = resolve(name)
     before, points = vars(owner).get(attribute), {name: define(agent="one_0")}

@@ -146,7 +146,7 @@ def telling(log, target, by=""):
 @EVERYWHERE
 @pytest.mark.parametrize("how", ["by name", "as itself"])
 @pytest.mark.parametrize(("name", "call", "result"), FORMS.values(), ids=FORMS)
-def test_handlers_extend_anything_importable(name, call, result, how, with_handlers):
+def test_plugins_extend_any_importable_function(name, call, result, how, with_handlers):
     log = []
     assert with_handlers(call, *telling(log, found(name, how))) == call() == result
     assert log == ["before", "after"]
@@ -156,7 +156,7 @@ def test_handlers_extend_anything_importable(name, call, result, how, with_handl
 
 
 @EVERYWHERE
-def test_handlers_of_a_position_run_in_order_and_their_changes_chain(
+def test_plugins_run_in_order_and_see_each_others_changes(
     with_handlers,
 ):
     function, seen = local(), []
@@ -181,7 +181,7 @@ def test_handlers_of_a_position_run_in_order_and_their_changes_chain(
 
 
 @EVERYWHERE
-def test_handlers_get_arguments_as_passed_under_any_parameter_names(with_handlers):
+def test_plugins_get_arguments_as_passed_under_any_parameter_names(with_handlers):
     @expose_to_plugins
     def function(value, more=2, most=3):
         return value, more, most
@@ -197,7 +197,7 @@ def test_handlers_get_arguments_as_passed_under_any_parameter_names(with_handler
 
 
 @EVERYWHERE
-def test_latest_instead_handler_runs_alone_and_may_call_the_original(with_handlers):
+def test_plugin_instead_runs_alone_and_can_call_the_original_function(with_handlers):
     function, log = local(), []
     first = (lambda *args: "first", function, "instead")
     latest = (lambda value, more=0: function.__wrapped__(value, more) * 10, function, "instead")
@@ -206,7 +206,7 @@ def test_latest_instead_handler_runs_alone_and_may_call_the_original(with_handle
     assert log == []
 
 
-def test_a_call_runs_the_handlers_that_were_attached_when_it_began():
+def test_plugin_attached_during_a_call_runs_from_the_next_call_on():
     function, log = local(), []
 
     def change(value, more=0):
@@ -226,7 +226,7 @@ def test_a_call_runs_the_handlers_that_were_attached_when_it_began():
 # -- what is exposed ------------------------------------------------------------------------------
 
 
-def test_a_method_is_exposed_for_one_class_and_may_be_exposed_again():
+def test_expose_to_plugins_exposes_a_method_for_one_class():
     held, log = vars(Trader), []
 
     class Model(Trader):
@@ -251,7 +251,7 @@ def test_a_method_is_exposed_for_one_class_and_may_be_exposed_again():
     assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
 
 
-def test_functions_without_dotted_names_can_be_exposed_and_are_listed():
+def test_expose_to_plugins_takes_functions_without_dotted_names():
     gc.collect()  # other tests have exposed functions, too
     first, function, length, items = (
         local(),
@@ -284,7 +284,7 @@ POOL = expose_to_plugins([1, 2])
 
 
 @EVERYWHERE
-def test_exposed_list_is_a_list_and_takes_handlers_by_name(with_handlers):
+def test_expose_to_plugins_keeps_a_list_a_list(with_handlers):
     assert isinstance(POOL, list)
     assert not isinstance(POOL, collections.abc.Iterator)
     assert (len(POOL), POOL[0], 2 in POOL, POOL == [1, 2]) == (2, 1, True, True)
@@ -303,7 +303,7 @@ def test_exposed_list_is_a_list_and_takes_handlers_by_name(with_handlers):
     assert [*POOL] == [1, 2]
 
 
-def test_exposed_iterator_stays_an_iterator():
+def test_expose_to_plugins_keeps_an_iterator_an_iterator():
     items = expose_to_plugins(iter([1, 2, 3]))
     assert expose_to_plugins(items) is items
     assert isinstance(items, collections.abc.Iterator)
@@ -314,7 +314,7 @@ def test_exposed_iterator_stays_an_iterator():
     assert list(items) == []
 
 
-def test_copies_of_an_exposed_iterable_have_its_handlers():
+def test_copied_iterable_exposed_to_plugins_keeps_its_plugins():
     items = expose_to_plugins([[1], [2]])
     with handlers((lambda thing, _result: ChangedResult(_result * 2), items, "after_next")):
         copied = copy.deepcopy(items)
@@ -362,7 +362,7 @@ def two(a, b):
     ],
     ids=plainly,
 )
-def test_handlers_that_cannot_work_are_refused_when_they_are_attached(entry, error):
+def test_attach_handler_refuses_plugins_that_cannot_work(entry, error):
     good = (nothing, f"{HERE}.two", "before")
     with pytest.raises(error), handlers(good, entry):
         raise AssertionError
@@ -379,7 +379,7 @@ async def items_of_a_stream():
     ("thing", "why"),
     [(Trader, "expose one of its"), (3, "neither"), (items_of_a_stream, "async generator")],
 )
-def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
+def test_expose_to_plugins_refuses_all_but_functions_and_iterables(thing, why):
     with pytest.raises(PatchError, match=why):
         expose_to_plugins(thing)
 
@@ -387,7 +387,7 @@ def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
 # -- for a while ----------------------------------------------------------------------------------
 
 
-def test_handler_blocks_and_removals_remove_only_their_own_handlers():
+def test_remove_handler_removes_only_its_own_plugin():
     function, log = local(), []
 
     def see(value, more=0):
@@ -425,9 +425,7 @@ def test_handler_blocks_and_removals_remove_only_their_own_handlers():
     ("position", "target"),
     [("before", BID), ("after", BID), ("instead", BID), ("after_next", f"{HERE}.counting")],
 )
-def test_handler_error_names_its_attachment_and_closes_the_generator(
-    position, target, with_handlers
-):
+def test_plugin_error_names_its_function_and_closes_the_generator(position, target, with_handlers):
     def call():
         return next(counting(3)) if position == "after_next" else Trader().bid("tea")
 
@@ -443,7 +441,7 @@ def test_handler_error_names_its_attachment_and_closes_the_generator(
 
 
 @EVERYWHERE
-def test_error_of_the_function_surfaces_and_no_handler_runs_after_it(with_handlers):
+def test_plugin_after_does_not_run_if_the_function_raises_an_error(with_handlers):
     function, log = local(), []
     with pytest.raises(TypeError) as caught:
         with_handlers(lambda: function("text", 1), *telling(log, function))
@@ -454,7 +452,7 @@ def test_error_of_the_function_surfaces_and_no_handler_runs_after_it(with_handle
 
 
 @EVERYWHERE
-def test_handlers_of_a_generator_see_its_arguments_items_and_return(
+def test_plugins_of_a_generator_get_its_arguments_items_and_return_value(
     with_handlers,
 ):
     log = []
@@ -479,7 +477,7 @@ def test_handlers_of_a_generator_see_its_arguments_items_and_return(
 
 @EVERYWHERE
 @pytest.mark.parametrize("position", ["before", "after_next"])
-def test_sent_values_and_thrown_errors_reach_the_generator(position, with_handlers):
+def test_plugins_pass_sent_values_and_errors_on_to_the_generator(position, with_handlers):
     def call():
         generator = counting(4)
         seen = [next(generator), generator.send(5), generator.throw(KeyError()), generator.send(7)]
@@ -516,7 +514,7 @@ def letters(number, step=1):
     ],
     ids=["generator", "list", "nothing", "string", "bytes"],
 )
-def test_instead_of_a_generator_a_handler_may_return_items_or_its_value(
+def test_plugin_instead_of_a_generator_can_return_items_or_a_value(
     instead, items, value, with_handlers
 ):
     returned = []
@@ -528,7 +526,7 @@ def test_instead_of_a_generator_a_handler_may_return_items_or_its_value(
     assert returned == [value]
 
 
-def test_a_handler_may_take_the_place_of_single_items_and_end_them():
+def test_plugin_can_replace_single_items_of_a_generator():
     left = letters(3)
     with handlers((lambda number, step=1: next(left), counting, "instead_next")):
         generator, ended = counting(3), counting(3)
@@ -540,7 +538,7 @@ def test_a_handler_may_take_the_place_of_single_items_and_end_them():
 
 
 @EVERYWHERE
-def test_coroutine_functions_stay_so_and_after_gets_the_awaited_result(with_handlers):
+def test_plugin_after_a_coroutine_function_gets_the_awaited_result(with_handlers):
     name, log = f"{MARKET}.Trader.wire", []
 
     async def before(self, amount):
@@ -568,7 +566,7 @@ def test_coroutine_functions_stay_so_and_after_gets_the_awaited_result(with_hand
 # -- seeing what happens --------------------------------------------------------------------------
 
 
-def test_calls_are_traced_in_the_order_in_which_they_begin():
+def test_trace_lists_calls_in_the_order_in_which_they_begin():
     function = local()
     with (
         handlers(
@@ -647,7 +645,7 @@ def says(word):
     return (lambda self: word, WORD, "instead")
 
 
-def test_plugins_apply_in_simulation_and_mappings_of_their_environment():
+def test_plugins_apply_to_the_simulation_and_mappings_of_their_env():
     env = single_env(House, House.water, plugins=[says("mine")], render_mode="ansi")
     simulation = env.simulation
     assert env.reset()[0].tolist() == [4, 0]
@@ -673,7 +671,7 @@ def test_plugins_apply_in_simulation_and_mappings_of_their_environment():
         lambda *args, **kwargs: generate_env(*args, **kwargs)(),
     ],
 )
-def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
+def test_envs_with_different_plugins_can_be_interleaved(make):
     words = {"one": [says("one")], "two": [says("two")], "plain": []}
     envs = {word: make(House, House.water, plugins=plugins) for word, plugins in words.items()}
     for _ in range(2):
@@ -691,7 +689,7 @@ def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
             assert set(env.simulation.log) == {word}
 
 
-def test_handlers_of_the_process_run_before_the_environments():
+def test_plugins_of_the_process_run_before_plugins_of_an_env():
     log = []
     process, environment = (
         telling(log, WORD, " of the process"),
@@ -713,7 +711,7 @@ def test_handlers_of_the_process_run_before_the_environments():
     env.close()
 
 
-def test_environments_may_be_collected_at_any_moment():
+def test_envs_with_plugins_can_be_garbage_collected_at_any_moment():
     """Also while handlers are made ready, which looks through those that environments have."""
 
     def look(frame, event, arg):
@@ -751,7 +749,7 @@ def test_environments_may_be_collected_at_any_moment():
     assert found.interceptors == hook_of(choose).interceptors == {}
 
 
-def test_functions_are_patched_only_while_an_environment_exists():
+def test_functions_are_patched_for_plugins_only_while_an_env_exists():
     before = vars(House)["word"]
     made = generate_env(House, House.water, plugins=[says("mine")])
     assert vars(House)["word"] is before
@@ -773,7 +771,7 @@ def ventilate(self):
     return "rule"
 
 
-def test_a_plugin_may_decide_and_extend_the_simulations_own_methods():
+def test_plugin_can_decide_and_extend_the_simulations_methods():
     plugins = [
         (lambda self: self.log.append("made"), f"{HERE}.House.__init__", "after"),
         (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
@@ -791,7 +789,7 @@ def test_a_plugin_may_decide_and_extend_the_simulations_own_methods():
 
 
 @pytest.mark.parametrize("where", ["before the points", "after the points", "of the environment"])
-def test_handlers_run_around_the_decision(where):
+def test_plugins_before_and_after_a_decision_point_run_around_the_decision(where):
     seen, decided = [], []
 
     def before(self, good, limit=5):
@@ -822,7 +820,7 @@ def test_handlers_run_around_the_decision(where):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(8))
-def test_environments_and_handlers_may_open_and_close_in_any_order(seed):
+def test_envs_and_plugins_can_be_added_and_removed_in_any_order(seed):
     random, live, log = Random(seed), [], []
     calls = {name: (call, result) for name, call, result in FORMS.values()}
 
@@ -863,7 +861,7 @@ def test_environments_and_handlers_may_open_and_close_in_any_order(seed):
         leave()
 
 
-def test_decision_functions_may_be_exposed_before_or_after_decoration():
+def test_expose_to_plugins_works_before_or_after_make_step():
     def choose():
         return "rule"
 
@@ -882,7 +880,7 @@ def test_decision_functions_may_be_exposed_before_or_after_decoration():
     assert log == [4, 4]
 
 
-def test_function_decorated_under_handlers_keeps_them_outside(monkeypatch):
+def test_make_step_under_attached_plugins_does_not_keep_the_plugins(monkeypatch):
     log = []
     monkeypatch.setattr(Trader, "bid", Trader.bid)  # which puts it back
     with handlers((lambda *args, **kwargs: log.append(1), BID, "before")):
@@ -899,7 +897,7 @@ def test_function_decorated_under_handlers_keeps_them_outside(monkeypatch):
     assert log == [1, 2, 3]
 
 
-def test_suspended_generators_have_the_plugins_of_their_environment():
+def test_suspended_generators_keep_the_plugins_of_their_env():
     items, envs = expose_to_plugins([1, 2, 3]), {}
 
     @expose_to_plugins
@@ -926,7 +924,7 @@ def test_suspended_generators_have_the_plugins_of_their_environment():
         ]
 
 
-def test_mappings_of_vector_environments_see_the_plugins_too(monkeypatch):
+def test_vector_env_plugins_apply_to_mappings_too(monkeypatch):
     # as long as no difference was made, less is entered
     monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", [])
     reward = {House.water: define(agent="a_0", reward_mapping=lambda self: len(self.word()))}

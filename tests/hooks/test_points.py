@@ -120,7 +120,7 @@ def test_points_option_takes_all_documented_forms(points, agents):
 @pytest.mark.parametrize(
     "points", [[Home.cool], f"{HOME}.cool", {Home.cool: define()}], ids=plainly
 )
-def test_points_default_to_the_points_of_the_simulation(points):
+def test_points_option_defaults_to_the_simulations_points(points):
     simulation = script(lambda simulation: [Home().heat(), Home().cool()])()
     simulation.points = points
     for source in (simulation, lambda: simulation):
@@ -128,7 +128,7 @@ def test_points_default_to_the_points_of_the_simulation(points):
         assert decisions(play(aec_env(source, Home.heat))) == ["heat_0"]
 
 
-def test_points_default_to_all_registered_ones_of_one_package(monkeypatch):
+def test_points_option_defaults_to_decorated_functions_of_one_package(monkeypatch):
     registered = []
     monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: registered)
     with pytest.raises(UnknownPointError, match="there is no decision point"):
@@ -185,7 +185,7 @@ def test_points_default_to_all_registered_ones_of_one_package(monkeypatch):
     ],
     ids=plainly,
 )
-def test_invalid_points_are_refused_at_construction(points, error, match):
+def test_env_refuses_invalid_points(points, error, match):
     for make in (aec_env, generate_env):
         with pytest.raises(error, match=match):
             make(home(), points)
@@ -196,7 +196,7 @@ def test_invalid_points_are_refused_at_construction(points, error, match):
 
 @pytest.mark.parametrize("how", ["by name", "as itself"])
 @pytest.mark.parametrize(("name", "call", "rule"), FORMS.values(), ids=FORMS)
-def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
+def test_undecorated_function_becomes_a_decision_point_by_its_name(name, call, rule, how):
     env = begun(aec_env(calling(call, call), {found(name, how): define()}))
     assert call() == rule  # for everybody else
     env.step(9)
@@ -205,7 +205,7 @@ def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
     assert call() == rule
 
 
-def test_an_inherited_point_gets_the_called_class():
+def test_decision_point_on_an_inherited_class_method_gets_the_called_class():
     seen = []
     env = aec_env(
         calling(lambda: Broker.opening(), lambda: Junior.opening(), lambda: Dealer.opening()),
@@ -226,7 +226,7 @@ BASE, SUB = {BID: define(agent="trader_0")}, {f"{MARKET}.Broker.bid": define(age
 @pytest.mark.parametrize(
     "points", [(BASE, SUB), (SUB, BASE), (BASE | SUB, SUB), (SUB, BASE | SUB)], ids=plainly
 )
-def test_environments_of_a_base_class_and_a_subclass_coexist(points):
+def test_envs_of_a_base_class_and_a_subclass_can_be_used_together(points):
     def bids():
         return [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)]
 
@@ -249,7 +249,7 @@ def test_environments_of_a_base_class_and_a_subclass_coexist(points):
 
 @pytest.mark.parametrize("end", ["close", "collect", "collect in mid-episode"])
 @pytest.mark.parametrize("name", ["Trader.rounded", "Trader.opening", "Broker.bid", "price"])
-def test_patches_last_until_the_last_environment_is_gone(name, end):
+def test_model_functions_stay_patched_until_their_last_env_is_gone(name, end):
     owner, attribute = resolve(f"{MARKET}.{name}")
     before = vars(owner).get(attribute)
     simulation = calling(Broker().day, lambda: market.price("tea"))
@@ -267,7 +267,7 @@ def test_patches_last_until_the_last_environment_is_gone(name, end):
     assert vars(owner).get(attribute) is before
 
 
-def test_modules_imported_in_mid_episode_are_patched_and_restored(monkeypatch):
+def test_env_patches_and_restores_modules_imported_in_mid_episode(monkeypatch):
     before, late = market.price, types.ModuleType("late_shop")
     monkeypatch.setitem(sys.modules, "late_shop", late)
     env = begun(
@@ -286,7 +286,7 @@ def test_modules_imported_in_mid_episode_are_patched_and_restored(monkeypatch):
 
 
 @pytest.mark.parametrize("first", range(3))
-def test_one_function_under_many_names_is_one_point(first):
+def test_function_with_several_names_is_one_decision_point(first):
     before = market.price
     calls = [lambda: market.price("tea"), lambda: shop.total("tea"), lambda: shop.total_cost("tea")]
     names = [f"{MARKET}.price", "tests.foreign.shop.price", "tests.foreign.shop.cost"]
@@ -304,7 +304,7 @@ def test_one_function_under_many_names_is_one_point(first):
 # -- environments of the same undecorated model ---------------------------------------------------
 
 
-def test_environments_of_one_undecorated_model_have_their_own_definitions():
+def test_envs_of_one_undecorated_model_can_have_different_definitions():
     other = decision()
     traders = calling(lambda: Trader().bid("tea"), other)
     one = aec_env(traders, {BID: define(action_space_mapping=lambda action: ("one", action))})
@@ -322,7 +322,7 @@ def test_environments_of_one_undecorated_model_have_their_own_definitions():
     assert (one.possible_agents, two.possible_agents) == (["bid_0"], ["b_0"])
 
 
-def test_local_classes_are_found_and_local_functions_must_be_decorated():
+def test_decision_point_in_a_local_class_works_without_a_decorator():
     class Local:
         def decide(self):
             return "rule"
@@ -339,7 +339,7 @@ def test_local_classes_are_found_and_local_functions_must_be_decorated():
         aec_env(calling(decide), {decide: define()})
 
 
-def test_threads_that_register_and_extend_functions_leave_each_other_alone(
+def test_threads_can_define_points_and_plugins_at_the_same_time(
     monkeypatch,
 ):
     def dawdle(hook, *args):
@@ -380,7 +380,7 @@ def test_threads_that_register_and_extend_functions_leave_each_other_alone(
 # -- in other processes ---------------------------------------------------------------------------
 
 
-def test_unpacked_point_is_the_existing_one_or_brings_one_hook(monkeypatch):
+def test_decision_point_sent_to_a_process_is_the_existing_one_there(monkeypatch):
     local = decision(agent="local_0")
     point = hook_of(Home.heat)
     assert unpack(pack(point)) is point
@@ -391,7 +391,7 @@ def test_unpacked_point_is_the_existing_one_or_brings_one_hook(monkeypatch):
     assert hook.definition.agent == "local_0"
 
 
-def test_functions_go_to_other_processes_by_name(monkeypatch):
+def test_decision_functions_are_sent_to_other_processes_by_name(monkeypatch):
     """The name leads there, whatever binds them: nothing is made anew."""
     functions = [Home.heat, Trader.bid, Home.light.__func__]
     assert [portable(function) for function in functions[:2]] == [f"{HOME}.heat", BID]
@@ -401,7 +401,7 @@ def test_functions_go_to_other_processes_by_name(monkeypatch):
     assert list(map(unpack, parcels)) == functions
 
 
-def test_notebook_definitions_are_sent_to_processes_by_value(monkeypatch):
+def test_decision_functions_of_a_notebook_are_sent_by_value(monkeypatch):
     main = sys.modules["__main__"]
     monkeypatch.delattr(main, "__file__", raising=False)
     with monkeypatch.context() as notebook:
@@ -415,7 +415,7 @@ def test_notebook_definitions_are_sent_to_processes_by_value(monkeypatch):
 # -- dicts from functions -------------------------------------------------------------------------
 
 
-def test_points_keyed_by_functions_work_while_environments_are_alive():
+def test_points_can_be_keyed_by_functions_while_other_envs_are_alive():
     """The class then has a wrapper, which is another key of the same point."""
     points = {Trader.bid: define(agent="old")}
     env = begun(aec_env(calling(lambda: Trader().bid("tea")), points))
@@ -434,7 +434,7 @@ def test_points_keyed_by_functions_work_while_environments_are_alive():
 
 
 @pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
-def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkeypatch):
+def test_env_checks_every_reward_even_if_difference_is_not_used(others, monkeypatch):
     monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", others)
     rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
     decide = decision(reward_mapping=lambda: next(rewards))
@@ -447,7 +447,7 @@ def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkey
         env.step(1)
 
 
-def test_a_name_with_a_definition_means_the_function_at_its_place():
+def test_decision_point_name_means_the_function_of_the_named_class():
     class Derived(Trader):
         bid = define(agent="derived")(Trader.bid)
 

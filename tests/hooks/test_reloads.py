@@ -63,7 +63,7 @@ def log_of(env):
     return env.simulation.log
 
 
-def test_new_environment_uses_the_redefined_functions(model):
+def test_new_env_uses_redefined_model_functions(model):
     old = aec_env(model.Sim, points_of(model, *NAMES))
     assert log_of(old) == [3] * 5
     exec(MODEL, vars(model))
@@ -77,7 +77,7 @@ def test_new_environment_uses_the_redefined_functions(model):
 
 
 @pytest.mark.parametrize("name", [*NAMES, "Kid.drain"])
-def test_an_old_environment_warns_of_functions_that_were_defined_again(model, name):
+def test_env_warns_if_its_model_functions_were_defined_again(model, name):
     env = aec_env(model.Sim, points_of(model, name))
     env.reset()
     exec(MODEL, vars(model))
@@ -89,7 +89,7 @@ def test_an_old_environment_warns_of_functions_that_were_defined_again(model, na
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_redefined_function_as_a_key_of_points_is_reported(model, name):
+def test_env_warns_of_an_outdated_function_as_a_key_of_points(model, name):
     owner, _, attribute = name.rpartition(".")
     points = {getattr(getattr(model, owner, model), attribute): define()}
     alive = model.Tank
@@ -103,7 +103,7 @@ def test_redefined_function_as_a_key_of_points_is_reported(model, name):
         aec_env(model.Sim, points).reset()
 
 
-def test_points_missing_after_a_redefinition_are_unregistered(model, monkeypatch):
+def test_decision_points_missing_after_a_redefinition_are_unregistered(model, monkeypatch):
     monkeypatch.setattr("simenv_marl.decision.hooks", lambda: [*map(hook_of, decorated)])
     decorated = [model.Tank.heat, model.pick]
     alive = aec_env(model.Sim)
@@ -117,7 +117,7 @@ def test_points_missing_after_a_redefinition_are_unregistered(model, monkeypatch
     assert aec_env(model.Sim).possible_agents == ["picker"]
 
 
-def test_targets_that_are_no_functions_are_not_looked_up(model):
+def test_env_does_not_warn_of_redefined_plugin_targets_without_a_function(model):
     largest = expose_to_plugins(partial(max, 3))
     calls = []
     plugin = (lambda *args: calls.append(args), largest, "before")
@@ -130,7 +130,7 @@ def test_targets_that_are_no_functions_are_not_looked_up(model):
     assert calls == [(2,)]
 
 
-def test_a_decorator_from_outside_may_run_again(model):
+def test_make_step_can_decorate_the_same_method_again(model):
     for number in range(3):
         model.Tank.drain = define(agent=f"tank {number}")(model.Tank.drain)
         env = aec_env(model.Sim, model.Tank.drain)
@@ -138,7 +138,7 @@ def test_a_decorator_from_outside_may_run_again(model):
         assert log_of(env)[0] == 3
 
 
-def test_a_module_on_disk_is_reloaded(tmp_path, monkeypatch):
+def test_new_env_uses_a_reloaded_model_module(tmp_path, monkeypatch):
     (tmp_path / "reloaded_file.py").write_text(HEAD + MODEL, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "reloaded_file", None)  # so the module is removed at the end

@@ -72,12 +72,12 @@ def check(url):
 
 
 @pytest.mark.parametrize("make", [queueing, painting])
-def test_a_served_seat_passes_the_validation_of_openenv(make):
+def test_openenv_server_of_an_agent_passes_openenvs_validation(make):
     with served(make) as url:
         check(url)
 
 
-def test_the_command_serves_a_seat_until_an_interrupt():
+def test_openenv_command_serves_an_agent_until_an_interrupt():
     server = command(GREENHOUSE, "--seat", "waterer_0", "--port", "0")
     try:
         url = re.search(r"http://127\.0\.0\.1:\d+", server.stdout.readline())[0]
@@ -89,7 +89,7 @@ def test_the_command_serves_a_seat_until_an_interrupt():
     assert server.returncode == 0
 
 
-def test_an_unknown_seat_is_refused_before_it_is_served():
+def test_openenv_command_refuses_an_unknown_agent():
     server = command(GREENHOUSE, "--seat", "nobody", "--port", "0")
     said, errors = server.communicate(timeout=60)
     assert (server.returncode, said) == (2, "")
@@ -99,7 +99,7 @@ def test_an_unknown_seat_is_refused_before_it_is_served():
 # -- one seat -------------------------------------------------------------------------------------
 
 
-def test_seat_has_the_prompts_and_actions_of_the_environment():
+def test_openenv_server_gives_the_prompts_and_actions_of_the_env():
     kind = seat(painting, name="shop")
     assert kind.__name__ == "shop"
     answer = kind.action_class
@@ -128,7 +128,7 @@ def test_seat_has_the_prompts_and_actions_of_the_environment():
     own.close()
 
 
-def test_values_of_arrays_are_answers():
+def test_openenv_server_accepts_numbers_lists_and_dicts_as_box_actions():
     kind = seat(watering)
     rewards = []
     for said in (0.25, [0.25], {"share of 1000 litres": 0.25}, "0.25"):
@@ -139,7 +139,7 @@ def test_values_of_arrays_are_answers():
     assert len(set(rewards)) == 1
 
 
-def test_requests_without_a_session_leave_nothing_behind():
+def test_openenv_requests_without_a_session_leave_nothing_behind():
     own = seat(watering)()
     with ThreadPoolExecutor(1) as pool:
         pool.submit(own.reset, seed=1).result()
@@ -169,7 +169,7 @@ def sockets():
     return [file for file in files if file.startswith("socket:")]
 
 
-def test_64_concurrent_sessions_match_sequential_ones_and_leak_nothing():
+def test_openenv_64_concurrent_sessions_match_sequential_ones():
     before = sockets()
     with served(watering) as url:
         alone = [play_in_session(url, number) for number in range(64)]
@@ -188,7 +188,7 @@ def test_64_concurrent_sessions_match_sequential_ones_and_leak_nothing():
     assert [reward for reward, _ in alone[3]] == plain
 
 
-def test_a_step_takes_at_most_three_milliseconds_more():
+def test_openenv_step_takes_at_most_three_milliseconds_more():
     def times(step):
         found = []
         for _ in range(90):

@@ -62,14 +62,14 @@ def traces(**arguments):
 @pytest.mark.parametrize(
     "arguments", [{"seeds": range(9)}, {"seeds": [5, 3], "batch_size": 1}, {"seeds": []}], ids=str
 )
-def test_workers_give_the_same_results_in_the_same_order(arguments):
+def test_simulate_many_workers_give_the_same_results_in_the_same_order(arguments):
     assert traces(workers=2, **arguments) == traces(**arguments)
     assert os.getpid() not in simulate_many(
         calling(), workers=2, collect=lambda model: os.getpid(), **arguments
     )
 
 
-def test_workers_collect_the_same_episodes():
+def test_collect_episodes_with_workers_returns_the_same_episodes():
     policies = {
         Creature.act: lambda observations: (
             policy(observations),
@@ -94,7 +94,7 @@ def test_workers_collect_the_same_episodes():
 
 
 @pytest.mark.thorough
-def test_functions_that_are_defined_anywhere_reach_the_workers():
+def test_simulate_many_workers_get_functions_defined_anywhere():
     """Functions without an importable name work in workers: local, differences, handlers."""
 
     class Model:
@@ -141,7 +141,7 @@ def test_functions_that_are_defined_anywhere_reach_the_workers():
         assert collected[Model.decide].rewards.tolist() == [4.0, 4.0, 1.0] * 3
 
 
-def test_undecorated_models_variants_and_closures_reach_the_workers():
+def test_simulate_many_workers_get_undecorated_models_and_variants():
     number, before = 7, vars(Creature)["act"]
     points = {Creature.act: colony_points(overseen=False)[Creature.act]}
     own = {"creature_0": lambda observation: 3}
@@ -159,7 +159,7 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
     assert vars(Creature)["act"] is before
 
 
-def test_errors_in_workers_keep_their_type():
+def test_simulate_many_errors_in_workers_keep_their_type():
     class LocalError(Exception):
         """Of which workers cannot know by its name."""
 
@@ -187,7 +187,7 @@ def test_errors_in_workers_keep_their_type():
         assert error is not ZeroDivisionError or "in main" in str(caught.value.__cause__)
 
 
-def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
+def test_simulate_many_keyboard_interrupt_cancels_the_remaining_work(monkeypatch):
     """After an interrupt between results, the rest is cancelled, and the next call works."""
 
     def interrupted(parcel):
@@ -235,7 +235,7 @@ SCRIPT = """
 """
 
 
-def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, monkeypatch):
+def test_simulate_many_workers_run_models_of_a_script(tmp_path, monkeypatch):
     """What a script defines has no name under which workers could import it."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*filter(None, sys.path), str(ROOT)]))
     path, begun = tmp_path / "script.py", tmp_path / "begun"
@@ -258,7 +258,7 @@ def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, mo
     assert printed.split() == [b"interrupted"]
 
 
-def test_progress_option_shows_a_bar(capsys):
+def test_simulate_many_progress_option_shows_a_bar(capsys):
     for workers in (0, 2):
         traces(seeds=range(5), workers=workers, progress=True)
         assert "5/5" in capsys.readouterr().err
@@ -267,7 +267,7 @@ def test_progress_option_shows_a_bar(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_backends_without_generators_share_the_work_evenly(monkeypatch):
+def test_joblib_backends_without_generators_share_the_work_evenly(monkeypatch):
     class Silent(ThreadingBackend):
         supports_return_generator = False
 
@@ -282,7 +282,7 @@ def test_backends_without_generators_share_the_work_evenly(monkeypatch):
 
 
 @pytest.mark.parametrize("seeds", [range(4), range(8)])
-def test_simulations_without_decisions_are_collected_in_order(seeds):
+def test_collect_episodes_includes_simulations_without_decisions_in_order(seeds):
     ant = decision(agent="ant_0")
     given = {
         "seeds": seeds,
@@ -300,7 +300,7 @@ def test_simulations_without_decisions_are_collected_in_order(seeds):
 @pytest.mark.thorough
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 @pytest.mark.parametrize("what", ["it cannot be started", "it ends"])
-def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
+def test_simulate_many_worker_that_fails_leaves_no_file_descriptors(what):
     alone(work_in_vain, what)
 
 
@@ -402,7 +402,7 @@ if __name__ == "__main__":
         "define(observation_space_mapping=pair, action_space_mapping=abs, reward_mapping=zero)",
     ],
 )
-def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
+def test_simulate_many_workers_find_a_scripts_decision_points_by_name(definition, tmp_path):
     """They are pickled by value with lambdas, and else found in the imported script."""
     path = tmp_path / "script.py"
     path.write_text(MAIN_SCRIPT.format(definition=definition), encoding="utf-8")
@@ -412,7 +412,7 @@ def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
 
 
 @pytest.mark.parametrize("backend", ["loky", "threading"])
-def test_progress_bar_moves_with_each_episode_of_a_worker(backend, capsys):
+def test_simulate_many_progress_bar_moves_with_each_episode_of_a_worker(backend, capsys):
     def asked(observation, *, _decision):
         return 5
 
@@ -426,7 +426,7 @@ def test_progress_bar_moves_with_each_episode_of_a_worker(backend, capsys):
     assert numbers[-1] == 60
 
 
-def test_progress_bar_counts_workers_that_cannot_reach_its_file(capsys, monkeypatch):
+def test_simulate_many_progress_bar_counts_workers_without_shared_files(capsys, monkeypatch):
     def update(bar, number=1):
         if threading.current_thread() is threading.main_thread():
             real(bar, number)
@@ -476,7 +476,7 @@ def seed_of(simulation):
 @pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 @pytest.mark.parametrize("batch_size", [1, 1024])
-def test_lost_runs_are_run_again_once_each_alone(batch_size, tmp_path):
+def test_simulate_many_repeats_runs_of_a_dead_worker_once_each_alone(batch_size, tmp_path):
     given = {"seeds": range(24), "workers": 2, "batch_size": batch_size, "collect": seed_of}
     found = simulate_many(doomed(tmp_path, always=(3,), once=(0, 7, 8, 21)), **given)
     assert isinstance(found[3], WorkerError)
@@ -489,7 +489,7 @@ def test_lost_runs_are_run_again_once_each_alone(batch_size, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
-def test_lost_episodes_are_left_out_of_trajectories(tmp_path):
+def test_collect_episodes_omits_episodes_whose_worker_died(tmp_path):
     given = {"points": valued.POINTS, "collect": seed_of, "batch_size": 2}
     model, policies = doomed(tmp_path, always=(2, 9), once=(4,)), {"keeper": ones}
     found = collect_episodes(model, policies, seeds=range(12), workers=2, **given)["keeper"]

@@ -100,7 +100,7 @@ def plain(client, play, **env):
 
 
 @pytest.mark.parametrize("ascii_only", [True, False])
-def test_values_go_to_the_model_and_back_unchanged(child, client, ascii_only):
+def test_client_libraries_pass_values_to_the_model_and_back_unchanged(child, client, ascii_only):
     large = [] if client.name == "C++" else [-(2**70)]
     for value in [*VALUES, *large]:
         line = json.dumps(
@@ -155,7 +155,7 @@ ARGUMENTS = {
 }
 
 
-def test_arguments_of_all_classes_are_sent(child, client):
+def test_client_libraries_send_arguments_of_all_types(child, client):
     calls, _ = child.play(play="arguments")
     assert repr([call["args"] for call in calls]) == repr(ARGUMENTS[client.name])
     assert "time" not in calls[0]
@@ -183,7 +183,7 @@ TYPES = {
 
 
 @TYPED
-def test_the_model_has_the_types_that_it_asks_for(child, client):
+def test_client_libraries_give_the_model_the_types_that_it_asks_for(child, client):
     for decisions, found in TYPES[client.name]:
         left = iter(decisions or [])
         _, last = child.play(
@@ -206,7 +206,7 @@ WRONG_TYPES = {
 
 
 @TYPED
-def test_a_decision_of_another_type_is_an_error_of_the_model(child, client):
+def test_client_libraries_raise_an_error_for_a_decision_of_another_type(child, client):
     kind, text = {
         "C++": (
             "simenv::JsonError",
@@ -228,7 +228,7 @@ def test_a_decision_of_another_type_is_an_error_of_the_model(child, client):
 
 
 @CPP
-def test_client_may_ask_without_a_rule(child):
+def test_cpp_client_can_ask_for_a_decision_without_a_rule(child):
     child.begin(play="optional")
     assert child.act(1, 2) == ended(2.0)
     child.begin(play="optional")
@@ -238,7 +238,7 @@ def test_client_may_ask_without_a_rule(child):
     assert child.decided == [None, 7]
 
 
-def test_the_decision_of_a_rule_that_fails_is_null(child):
+def test_client_libraries_report_null_if_the_rule_fails(child):
     child.begin(play="careless")
     child.send(act=1, rule=True)
     assert [child.receive() for _ in range(2)] == [
@@ -249,7 +249,7 @@ def test_the_decision_of_a_rule_that_fails_is_null(child):
     assert child.decided == [1]
 
 
-def test_clients_send_updates_removals_and_expected_calls(child, client):
+def test_client_libraries_send_updates_removals_and_expected_calls(child, client):
     entity = "12" if client.name == "Java" else 12
     call = {"point": "a", "args": {"level": 0.5}, "time": 1.5}
     assert [child.begin(play="reports"), *(child.receive() for _ in range(6))] == [
@@ -263,12 +263,12 @@ def test_clients_send_updates_removals_and_expected_calls(child, client):
     ]
 
 
-def test_a_model_may_end_its_episode_truncated(child):
+def test_client_libraries_let_a_model_truncate_its_episode(child):
     assert child.begin(play="truncated") == ended({"reached": 3}, truncated=True)
     assert child.begin(play="none") == ended()
 
 
-def test_a_rule_may_decide_if_it_is_not_reported(client):
+def test_client_libraries_allow_a_decision_inside_a_rule_not_reported(client):
     with Child(*client.command, NESTED="1") as child:
         assert sorted(child.receive()["can"]) == ["expect", "reseed"]
         frames = child.begin(play="nested"), child.rule(1)
@@ -279,7 +279,7 @@ def test_a_rule_may_decide_if_it_is_not_reported(client):
         assert child.act(2, 6) == ended(60)
 
 
-def test_a_rule_that_is_reported_and_decides_is_an_error(child):
+def test_client_libraries_refuse_a_decision_inside_a_rule_that_is_reported(child):
     child.begin(play="nested")
     text = child.rule(1)["error"]["text"]
     assert re.match("the rule of a has asked for a decision.*report_?[rR]ules", text)
@@ -287,12 +287,12 @@ def test_a_rule_that_is_reported_and_decides_is_an_error(child):
 
 
 @CPP
-def test_braced_pairs_in_cpp_are_json_objects(child):
+def test_cpp_client_sends_braced_pairs_as_json_objects(child):
     assert child.begin(play="objects") == ended({"a": 1, "b": {"c": "d"}, "e": [1, "f"]})
 
 
 @PYTHON
-def test_a_decorated_function_decides(child):
+def test_python_client_asks_for_the_decision_of_a_decorated_function(child):
     asked = child.begin(play="decorated")
     assert asked == {"decide": 1, "point": "a", "entity": "x", "time": 2.0, "args": {"level": 3}}
     assert child.rule(1) == ended(4)
@@ -301,7 +301,7 @@ def test_a_decorated_function_decides(child):
 
 
 @PYTHON
-def test_a_decision_in_another_thread_is_an_error_that_names_both(child):
+def test_python_client_refuses_decisions_in_another_thread(child):
     error = child.begin(play="threaded")["error"]
     assert error["type"] == "RuntimeError"
     assert "thread 'callbacks'" in error["text"]
@@ -311,7 +311,7 @@ def test_a_decision_in_another_thread_is_an_error_that_names_both(child):
 
 
 @JAVA
-def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
+def test_java_client_lets_threads_decide_one_at_a_time_and_stops_them(child):
     calls, last = child.play(lambda call: call["args"]["n"] + 1, play="threads")
     assert [call["decide"] for call in calls] == list(range(1, 201))
     assert last == ended([50, 100, 150, 200])
@@ -327,7 +327,7 @@ def slowly(call):
 
 
 @JAVA
-def test_a_thread_of_a_stopped_episode_does_not_decide_in_the_next(child):
+def test_java_client_thread_of_a_stopped_episode_does_not_decide_later(child):
     child.begin(play="late_threads")
     child.send(stop=True)
     calls, _ = child.play(slowly, play="late_threads")
@@ -337,7 +337,7 @@ def test_a_thread_of_a_stopped_episode_does_not_decide_in_the_next(child):
 SEEDS = {"C++": (0, 2**64 - 1), "Java": (-(2**63), 2**63 - 1), "Python": (0, 2**31 - 1)}
 
 
-def test_client_gets_its_seed_and_draws_one_if_it_is_null(child, client):
+def test_client_libraries_get_a_seed_or_draw_one(child, client):
     least, most = SEEDS[client.name]
     for seed in (least, 7, most):
         assert child.begin(seed, play="seed") == ended(seed)
@@ -349,7 +349,7 @@ def test_client_gets_its_seed_and_draws_one_if_it_is_null(child, client):
     assert least <= min(drawn) <= max(drawn) <= most
 
 
-def test_generators_are_seeded_anew_before_an_answer(child, client):
+def test_client_libraries_reseed_generators_before_an_answer(child, client):
     child.begin(play="reseed")
     child.send(reseed=12)
     child.send(reseed=13)
@@ -357,7 +357,7 @@ def test_generators_are_seeded_anew_before_an_answer(child, client):
     assert child.rule(1) == ended(13 + own)
 
 
-def test_a_stop_unwinds_the_model_which_is_silent_until_the_next_start(child, client):
+def test_client_libraries_unwind_the_model_at_a_stop(child, client):
     for answered in (0, 1, 1):
         child.begin(play="count")
         if answered:
@@ -375,7 +375,7 @@ def test_a_stop_unwinds_the_model_which_is_silent_until_the_next_start(child, cl
     [("C++", False), ("C++", True), ("Java", True), ("Python", False), ("Python", True)],
     indirect=["client"],
 )
-def test_model_that_ignores_a_stop_is_ended(child, client, gone):
+def test_client_libraries_end_a_model_that_ignores_a_stop(child, client, gone):
     child.begin(play="deaf")
     if gone:
         child.out.close()
@@ -389,7 +389,7 @@ def test_model_that_ignores_a_stop_is_ended(child, client, gone):
 
 @CPP
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
-def test_many_stops_do_not_grow_the_memory_of_the_client(child):
+def test_cpp_client_does_not_leak_memory_over_many_stops(child):
     resident = []
     for number in range(3_000):
         child.begin(play="count")
@@ -444,7 +444,7 @@ TRACES = {
 }
 
 
-def test_an_error_is_sent_and_the_next_episode_works(child, client):
+def test_client_libraries_send_a_models_error_and_play_the_next_episode(child, client):
     for play, (kind, text) in FAILURES[client.name].items():
         error = child.begin(play=play)
         error = (child.rule(1) if "decide" in error else error)["error"]
@@ -456,13 +456,13 @@ def test_an_error_is_sent_and_the_next_episode_works(child, client):
 
 
 @CPP
-def test_an_option_of_another_type_is_an_error_that_names_it(child):
+def test_cpp_client_names_an_option_of_another_type(child):
     assert child.begin(play="leave", status="x")["error"]["text"].startswith(
         'option status: "x" is not of the type'
     )
 
 
-def test_lines_of_the_maximum_length_are_sent_and_received(child):
+def test_client_libraries_send_and_receive_lines_of_the_maximum_length(child):
     text = "y" * (LONGEST - 100)
     assert len(child.begin(value=text)["args"]["value"]) == len(text)
     assert child.act(1, text) == ended(text)
@@ -505,7 +505,7 @@ ANSWERS = {
     indirect=["client"],
     ids=lambda value: repr(value[:40]),
 )
-def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
+def test_client_libraries_end_with_an_error_after_an_invalid_answer(child, client, line):
     child.begin(play="count")
     child.send(line + b"\n")
     error = child.receive()["error"]
@@ -522,7 +522,7 @@ def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
     )
 
 
-def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
+def test_client_libraries_end_with_an_error_after_an_unexpected_answer(child, client):
     child.begin(play="count")
     child.send(stop=True)
     error = child.rule(1)["error"]
@@ -537,7 +537,7 @@ def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
 @pytest.mark.parametrize(
     "frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": 0.5}}, {"start": 1}]
 )
-def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
+def test_client_libraries_end_with_an_error_after_an_invalid_start(child, frame):
     child.send(**frame)
     assert child.receive()["error"]["type"].endswith("WireError")
     assert has_given_up(child)
@@ -546,7 +546,7 @@ def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
 @pytest.mark.parametrize(
     "closed", [["out"], ["into", "out"], ["into"]], ids=["input", "both", "output"]
 )
-def test_client_ends_when_the_pipes_of_its_parent_close(child, client, closed):
+def test_client_libraries_end_when_their_parents_pipes_close(child, client, closed):
     if "into" in closed:
         child.begin(play="count")
     for end in closed:
@@ -556,13 +556,13 @@ def test_client_ends_when_the_pipes_of_its_parent_close(child, client, closed):
     assert child.ended() == (0, "", client.unwound if "into" in closed else ""), "and no signal"
 
 
-def test_a_model_may_exit(child):
+def test_client_libraries_let_a_model_exit_its_process(child):
     assert child.begin(play="leave", status=3) is None
     assert child.ended()[0] == 3
 
 
 @pytest.mark.parametrize("client", ["C++", "Python"], indirect=True)
-def test_processes_of_the_model_inherit_nothing_of_the_wire(child, client):
+def test_client_libraries_keep_pipes_from_processes_of_the_model(child, client):
     reading, writing = child.descriptors
     command = (
         f'test -z "$SIMENV_MARL_FDS" && ! test -e /dev/fd/{reading} && ! test -e /dev/fd/{writing}'
@@ -574,7 +574,7 @@ def test_processes_of_the_model_inherit_nothing_of_the_wire(child, client):
         )
 
 
-def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
+def test_client_libraries_run_the_rule_without_an_environment(client):
     done = plain(client, "count")
     assert (done.stdout, done.stderr) == ("5\n", "unwound by rule 7\n")
     failed = plain(client, "fail")
@@ -594,7 +594,7 @@ INVALID = ["", "3,", "a,b", "3,4,5", "998,999"]
     ],
     indirect=["client"],
 )
-def test_client_refuses_invalid_descriptors(client, said, text):
+def test_client_libraries_refuse_invalid_descriptors(client, said, text):
     done = plain(client, "echo", SIMENV_MARL_FDS=said)
     assert done.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
     assert text in done.stderr
@@ -605,12 +605,12 @@ def test_client_refuses_invalid_descriptors(client, said, text):
 PYTHON_CLIENT = HERE.parents[1] / "clients" / "python" / "simenv_marl_client.py"
 
 
-def test_the_client_in_python_keeps_to_the_syntax_of_its_oldest_version():
+def test_python_client_uses_only_syntax_of_its_oldest_python():
     ast.parse(PYTHON_CLIENT.read_text(encoding="utf-8"), feature_version=(3, 8))
 
 
 @pytest.mark.parametrize("client", [f"Python 3.{minor}" for minor in (8, 9, 10, 13)], indirect=True)
-def test_the_client_in_python_plays_with_other_pythons(child):
+def test_python_client_works_with_other_python_versions(child):
     for value in VALUES:
         assert child.begin(value=value)["args"] == {"value": value}
         assert repr(child.act(1, value)) == repr(ended(value))

@@ -51,7 +51,7 @@ def folder(env):
 
 
 @pytest.mark.greenlet("both drivers play episodes, one by one, below")
-def test_interleaved_runs_match_plain_runs(make_env):
+def test_energyplus_interleaved_episodes_match_runs_without_env(make_env):
     seeds = (3, 4, 5, 3)
     envs = [make_env(zones.raw_env) for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
@@ -66,7 +66,7 @@ def test_interleaved_runs_match_plain_runs(make_env):
 
 
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
-def test_an_end_in_mid_episode_and_a_new_one_that_is_the_plain_run(trigger):
+def test_energyplus_episode_after_an_aborted_one_matches_a_run_without_env(trigger):
     env = begun(zones.raw_env(), 3)
     for _ in range(25):
         env.step(at(16.0))
@@ -90,7 +90,7 @@ def test_an_end_in_mid_episode_and_a_new_one_that_is_the_plain_run(trigger):
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
+def test_energyplus_model_error_is_raised_by_env_step(make_env, error, monkeypatch):
     def account(self, hours):
         if self.building.steps == 200:
             raise error("in the model")
@@ -110,7 +110,7 @@ def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
 
 @pytest.mark.greenlet("with threads there is no fork")
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_branches_continue_exactly(make_env, method):
+def test_energyplus_branches_continue_exactly(make_env, method):
     env = begun(make_env(zones.raw_env), 3)
     for _ in range(101):
         env.step(at(18.0))
@@ -128,7 +128,7 @@ def test_branches_continue_exactly(make_env, method):
 
 
 @pytest.mark.greenlet("there is no environment")
-def test_model_runs_alone_and_its_policy_comparison_prints_a_result(capfd):
+def test_energyplus_example_prints_a_comparison_of_policies(capfd):
     house.main()
     assert "kWh" in capfd.readouterr().out
     policy.main(["--seeds", "2"])
@@ -136,7 +136,7 @@ def test_model_runs_alone_and_its_policy_comparison_prints_a_result(capfd):
 
 
 @pytest.mark.greenlet("there is no environment")
-def test_policies_decide_in_plain_runs():
+def test_energyplus_policies_decide_in_simulate():
     simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
     assert simulation.results == plain(3)[0]
     other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, policy.by_presence), seed=3)

@@ -14,7 +14,7 @@ pytestmark = [
 ]
 
 
-def test_robots_join_in_pairs_and_leave_one_by_one(make_env):
+def test_enki_robots_join_in_pairs_and_leave_one_by_one(make_env):
     env = make_env(robots.parallel_env)
     env.reset(seed=7)
     born, gone, truncated, rounds = dict.fromkeys(env.agents, 0), set(), set(), 0
@@ -31,7 +31,7 @@ def test_robots_join_in_pairs_and_leave_one_by_one(make_env):
     assert rounds == 240, "one for each half second"
 
 
-def test_robots_of_a_pair_each_get_the_team_reward(make_env):
+def test_enki_robots_of_a_pair_each_get_the_team_reward(make_env):
     env = make_env(robots.parallel_env)
     env.reset(seed=7, options={"seconds": 20.0})
     paid = {agent: [] for agent in env.agents}
@@ -44,7 +44,7 @@ def test_robots_of_a_pair_each_get_the_team_reward(make_env):
 
 
 @pytest.mark.greenlet("the driver makes no difference to policies")
-def test_robots_by_the_rule_sweep_more_than_robots_going_straight():
+def test_enki_robots_by_the_rule_sweep_more_than_robots_going_straight():
     contenders = {"rule": {}, "straight": {"robot.turn": lambda _: np.zeros(1, np.float32)}}
     swept = evaluate(
         robots.robots,
@@ -56,6 +56,6 @@ def test_robots_by_the_rule_sweep_more_than_robots_going_straight():
 
 
 @pytest.mark.greenlet("nothing runs here")
-def test_the_model_keeps_to_the_wire():
+def test_enki_simulator_passes_wire_check():
     report = check_wire([str(robots.program())])
     assert {finding.verdict for finding in report.findings} == {"ok"}, str(report)

@@ -77,7 +77,7 @@ def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("what", IN_MID_EPISODE)
-def test_faults_in_mid_episode_are_errors(make_env, what):
+def test_process_simulation_raises_an_error_for_each_fault_in_mid_episode(make_env, what):
     kind, text = IN_MID_EPISODE[what]
     env = before_its_fault(what, make_env)
     number = child(env)
@@ -103,7 +103,7 @@ def test_faults_in_mid_episode_are_errors(make_env, what):
         ("", "cannot be started"),
     ],
 )
-def test_a_command_that_starts_no_simulator_is_an_error_with_the_reason(command, text):
+def test_process_simulation_error_tells_why_its_command_does_not_start(command, text):
     simulation = ProcessSimulation(command, BOTH)
     for _ in range(2):
         with pytest.raises(ProcessDiedError, match=text):
@@ -112,7 +112,7 @@ def test_a_command_that_starts_no_simulator_is_an_error_with_the_reason(command,
 
 
 @pytest.mark.parametrize("when", ["waiting", "between episodes"])
-def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
+def test_process_simulation_killed_does_not_affect_other_processes(make_env, when):
     envs = [make_env(aec_env, reservoirs()) for _ in range(3)]
     for env in envs:
         env.reset(seed=1)
@@ -131,7 +131,7 @@ def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
     ]
 
 
-def test_a_process_that_does_not_read_is_an_error(make_env):
+def test_process_simulation_raises_an_error_if_the_process_does_not_read(make_env):
     env = before_its_fault("silence", make_env)
     simulation = env.simulation
     simulation._child.timeout = 0.3
@@ -142,7 +142,7 @@ def test_a_process_that_does_not_read_is_an_error(make_env):
         env.step(RULE)
 
 
-def test_long_lines_cross_in_both_directions(make_env):
+def test_process_simulation_sends_and_receives_long_lines(make_env):
     env = make_env(aec_env, reservoirs())
     assert plays_by_its_rule(env, long=["ö" * 1000] * 2000, hours=3)
     with pytest.raises(WireError, match=r"the limit is 16,777,216"):
@@ -164,7 +164,7 @@ time.sleep(600)
 """
 
 
-def test_error_quotes_stderr_written_after_the_last_frame():
+def test_process_simulation_error_quotes_the_end_of_stderr():
     process = Child([sys.executable, "-c", TALKS], 60.0)
     process.send(b"\n")
     assert select.select([process._stderr], [], [], 60.0)[0]
@@ -172,7 +172,7 @@ def test_error_quotes_stderr_written_after_the_last_frame():
         process.receive()
 
 
-def test_endless_stderr_does_not_delay_the_timeout(monkeypatch):
+def test_process_simulation_timeout_works_despite_endless_stderr(monkeypatch):
     monkeypatch.setattr(Child, "_read_stderr", lambda process: True)  # so that there is always more
     with pytest.raises(ProcessTimeoutError, match="sent nothing"):
         ProcessSimulation(["sleep", "600"], BOTH, timeout=1.0).reset()
@@ -186,7 +186,7 @@ def in_a_fork(check):
     assert process.exitcode == 0
 
 
-def test_forked_environment_can_reset_but_not_use_or_end_the_process(make_env):
+def test_process_simulation_in_a_fork_can_only_reset(make_env):
     env = begun(make_env(aec_env, reservoirs()), 1)
     number = child(env)
 
@@ -209,11 +209,11 @@ def test_forked_environment_can_reset_but_not_use_or_end_the_process(make_env):
     assert env.simulation.result == by_its_rule(1)
 
 
-def test_descriptors_and_processes_are_released():
+def test_process_simulation_releases_descriptors_and_processes():
     alone(fail_many_times)
 
 
-def test_a_process_that_gets_one_pipe_of_two_gives_it_back(monkeypatch):
+def test_process_simulation_closes_its_pipe_if_the_second_one_fails(monkeypatch):
     pipes = [os.pipe()]
 
     def pipe():
@@ -248,7 +248,7 @@ def fail_many_times():
     assert descriptors() == before
 
 
-def test_killed_process_with_a_lost_exit_code_is_an_error():
+def test_process_simulation_killed_with_a_lost_exit_code_raises_an_error():
     alone(ignore_children)
 
 
@@ -279,7 +279,7 @@ while True:
 """
 
 
-def test_busy_process_ends_when_its_parent_is_killed():
+def test_process_simulation_busy_process_ends_when_its_parent_is_killed():
     parent = f"""
 import signal, threading
 from simenv_marl.remote.child import Child
@@ -299,7 +299,7 @@ signal.pause()
     assert all(map(gone, numbers))
 
 
-def test_unresponsive_processes_are_ended_in_one_grace_period(monkeypatch):
+def test_process_simulations_that_hang_are_ended_in_one_grace_period(monkeypatch):
     clock = [0.0]
     env = begun(vector_env(reservoirs({"broker.price": PRICE}), "broker.price", num_envs=5), 1)
     numbers = [simulation._child.pid for simulation in env.get_attr("simulation")]
@@ -312,7 +312,7 @@ def test_unresponsive_processes_are_ended_in_one_grace_period(monkeypatch):
     assert clock[0] < 1.5 * GRACE
 
 
-def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
+def test_process_simulation_ignores_an_end_frame_after_a_stop(make_env):
     for arrived, text in ((False, '(after "stop"|before the start)'), (True, "before the start")):
         env = before_its_fault("end after stop", make_env)
         if arrived:
@@ -324,7 +324,7 @@ def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
         env.reset(seed=2)
 
 
-def test_an_interrupt_ends_the_process(tmp_path):
+def test_process_simulation_keyboard_interrupt_ends_the_process(tmp_path):
     script = 'echo $$ > "$0"; sleep 0.5; kill -INT $PPID; sleep 600'
     simulation = ProcessSimulation(["sh", "-c", script, str(tmp_path / "number")], BOTH)
     with pytest.raises(KeyboardInterrupt) as caught:

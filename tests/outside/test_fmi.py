@@ -45,7 +45,7 @@ def heat(power):
 
 
 @KINDS
-def test_interleaved_episodes_match_plain_runs_after_aborted_ones(make_env, kind):
+def test_fmi_interleaved_episodes_match_runs_without_env(make_env, kind):
     seeds, steps = (3, 4, 3), 192
     envs = [make_env(single_env, RoomSim(kind)) for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
@@ -64,14 +64,14 @@ def test_interleaved_episodes_match_plain_runs_after_aborted_ones(make_env, kind
 
 
 @NEEDS_C
-def test_fmi2_fmi3_and_c_models_give_the_same_results():
+def test_fmi_2_fmi_3_and_c_models_give_the_same_results():
     assert plain("fmi2", 3) == plain("fmi3", 3) == pytest.approx(plain("c", 3), rel=1e-12)
 
 
 @pytest.mark.greenlet("with threads there is no fork")
 @KINDS
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_a_clone_goes_on_exactly_without_the_units_own_states(make_env, kind, method):
+def test_fmi_clone_continues_exactly_even_if_the_unit_has_no_states(make_env, kind, method):
     env = make_env(single_env, RoomSim(kind))
     env.reset(seed=5)
     powers = np.random.default_rng(0).uniform(0.0, 2.0, 192)
@@ -89,7 +89,7 @@ def test_a_clone_goes_on_exactly_without_the_units_own_states(make_env, kind, me
 
 @pytest.mark.greenlet("the driver makes no difference to the spaces")
 @KINDS
-def test_bounds_and_units_come_from_the_variable_its_type_or_the_user(kind):
+def test_fmi_spaces_take_bounds_from_the_variable_its_type_or_the_user(kind):
     description = read_model_description(unit(kind))
     names = ("power", *OBSERVED)
     if kind == "fmi2":
@@ -112,7 +112,7 @@ def test_bounds_and_units_come_from_the_variable_its_type_or_the_user(kind):
 
 
 @pytest.mark.greenlet("the driver makes no difference to the spaces")
-def test_variables_that_are_not_real_have_discrete_spaces():
+def test_fmi_variables_that_are_not_real_have_discrete_spaces():
     level = SimpleType(
         name="Level", type="Enumeration", items=[Item(name="low", value="1"), Item("high", "2")]
     )
@@ -144,7 +144,7 @@ def test_variables_that_are_not_real_have_discrete_spaces():
 
 @pytest.mark.greenlet("the driver makes no difference to learning")
 @NEEDS_C
-def test_the_heater_learns_to_beat_the_thermostat(capsys):
+def test_fmi_heater_learns_to_beat_the_thermostat(capsys):
     train.main(["--generations", "1", "--seeds", "2"])
     assert "Evaluation: rule, trained on 2 seeds" in capsys.readouterr().out
     contenders = {

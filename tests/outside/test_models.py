@@ -71,7 +71,7 @@ pytestmark = [
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in MODELS])
-def test_rule_episodes_match_the_plain_model_after_aborted_ones(make_env, name):
+def test_outside_model_envs_with_rule_actions_run_like_without_env(make_env, name):
     _, example, episodes = MODELS[name]
     env, processes = make_env(example.raw_env), set()
     for steps, (seed, options) in zip((0, 1, 40, 300), episodes, strict=True):
@@ -87,7 +87,7 @@ def test_rule_episodes_match_the_plain_model_after_aborted_ones(make_env, name):
 
 
 @needs("network")
-def test_code_of_the_ns3_page_runs(capsys):
+def test_code_of_the_ns3_page_runs_as_printed(capsys):
     (code,) = blocks("ns3.md")
     exec(code, {"__name__": "page"})
     assert capsys.readouterr().out == f"{plain(network, 7, seconds=10)}\n"
@@ -121,7 +121,7 @@ def environment(command):
 
 @pytest.mark.thorough
 @needs("town")
-def test_the_code_of_the_page_on_java(here, capsys):
+def test_code_of_the_java_page_runs_as_printed(here, capsys):
     (here / "Ferries.java").write_text(shown("java")[0])
     shutil.copy(building.CLIENT, here)
     commands = shown("sh")[1]
@@ -138,7 +138,7 @@ def test_the_code_of_the_page_on_java(here, capsys):
 
 @pytest.mark.thorough
 @needs("town")
-def test_the_code_of_the_page_on_the_town(capsys):
+def test_code_of_the_town_page_runs_as_printed(capsys):
     names = {"__name__": "__main__"}
     exec(blocks(PAGE, "Larger models")[0], names)
     earned = names["found"].values()
@@ -148,7 +148,7 @@ def test_the_code_of_the_page_on_the_town(capsys):
     assert "by the granary" in capsys.readouterr().out
 
 
-def test_the_code_of_the_page_on_python(here, capsys):
+def test_code_of_the_page_on_python_simulators_runs_as_printed(here, capsys):
     (here / "ferries.py").write_text(shown("python")[0], encoding="utf-8")
     shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)
     command = [sys.executable, "ferries.py"]
@@ -164,7 +164,7 @@ def test_the_code_of_the_page_on_python(here, capsys):
 @pytest.mark.skipif(
     COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed"
 )
-def test_the_code_of_the_page_on_cpp(here, capsys):
+def test_code_of_the_cpp_page_runs_as_printed(here, capsys):
     whole, own_loop, *_ = shown("cpp")
     (here / "ferries.cpp").write_text(whole, encoding="utf-8")
     program = str(compiled(here / "ferries.cpp", here))

@@ -58,7 +58,7 @@ def _cheap(observation):
     return 0
 
 
-def test_rule_matches_the_plain_run_with_one_process_for_all_episodes(make_env):
+def test_process_simulation_with_rule_actions_runs_like_without_env(make_env):
     env = make_env(aec_env, reservoirs())
     numbers = set()
     for seed in range(3):
@@ -76,7 +76,7 @@ def test_rule_matches_the_plain_run_with_one_process_for_all_episodes(make_env):
     assert plays_by_its_rule(env)
 
 
-def test_options_arrive_and_a_truncation_is_reported(make_env):
+def test_process_simulation_gets_reset_options_and_reports_truncation(make_env):
     env = make_env(aec_env, reservoirs())
     env.reset(seed=1, options={"hours": 4, "truncated": True})
     *_, last = play(env, reset=False)
@@ -84,7 +84,7 @@ def test_options_arrive_and_a_truncation_is_reported(make_env):
     assert env.simulation.result == by_its_rule(1, hours=4)
 
 
-def test_a_process_that_exits_after_its_episodes_is_started_anew(make_env):
+def test_process_simulation_restarts_a_process_that_has_exited(make_env):
     env = make_env(aec_env, ProcessSimulation(command("2"), BOTH))
     numbers = set()
     for seed in range(5):
@@ -93,7 +93,7 @@ def test_a_process_that_exits_after_its_episodes_is_started_anew(make_env):
     assert len(numbers) == 3
 
 
-def test_a_process_simulation_runs_without_an_environment():
+def test_process_simulation_runs_without_an_environment():
     simulation = reservoirs()
     simulation.reset(4)
     assert simulation.run() is None
@@ -107,7 +107,7 @@ def test_a_process_simulation_runs_without_an_environment():
     assert not runs(number)
 
 
-def test_single_and_joint_and_vector_views(make_env):
+def test_process_simulation_works_in_single_joint_and_vector_env(make_env):
     one = make_env(single_env, reservoirs(), "reservoir.inflow", agent="b")
     assert one.reset(seed=1)[0].tolist()[1] == 0.0
     joint = make_env(joint_env, reservoirs(), "broker.price")
@@ -118,7 +118,7 @@ def test_single_and_joint_and_vector_views(make_env):
     many.step(np.array([0, 1, 0]))
 
 
-def test_policies_answer_by_agent_and_by_point(make_env):
+def test_process_simulation_policies_answer_by_agent_and_by_decision_point(make_env):
     simulation = simulate(
         reservoirs(), {"broker.price": _cheap, "a": lambda observation: np.zeros(1)}, seed=1
     )
@@ -131,7 +131,7 @@ def test_policies_answer_by_agent_and_by_point(make_env):
     assert env.simulation.result["price"] == 2.0
 
 
-def test_points_may_be_redefined_and_the_result_of_apply_is_sent(make_env):
+def test_process_simulation_sends_the_result_of_apply(make_env):
     answer = replace(
         PRICE, action_space_mapping=None, apply=lambda action, call: float(action) + call.total
     )
@@ -147,7 +147,7 @@ def _price(simulation):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_simulate_many_and_evaluate_run_processes(workers):
+def test_process_simulation_works_in_simulate_many_and_evaluate(workers):
     policies = {"broker.price": lambda observations: np.ones(len(observations), int)}
     found = simulate_many(
         reservoirs({"broker.price": PRICE}), policies, seeds=range(4), workers=workers
@@ -181,7 +181,7 @@ PLAIN = make_step(
 @pytest.mark.parametrize(
     "name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.outside.main"]
 )
-def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
+def test_process_simulation_points_can_have_any_name(make_env, name):
     before, seen = json.dumps, []
     # sends as little as it may
     simulation = ProcessSimulation([sys.executable, outside.__file__, "bare", name], {name: PLAIN})
@@ -197,7 +197,7 @@ def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
     assert env.simulation.result == [None] * 6
 
 
-def test_handlers_extend_decisions_by_their_name(make_env):
+def test_process_simulation_plugins_extend_decisions_by_name(make_env):
     assert plays_by_its_rule(make_env(aec_env, reservoirs()))
     with handlers((lambda call: 7.0, "broker.price", "instead")):
         assert simulate(reservoirs(), seed=1).result["price"] == 7.0
@@ -215,7 +215,7 @@ def _played_out(env, number=0):
     return env.simulation.result
 
 
-def test_branches_by_replay_are_exact_and_forks_are_refused(make_env):
+def test_process_simulation_branches_by_replay_and_refuses_forks(make_env):
     env = _begun(make_env(aec_env, reservoirs()), 7)
     if env.unwrapped.driver == "greenlet":
         with pytest.raises(BranchError, match="child process"):
@@ -223,13 +223,13 @@ def test_branches_by_replay_are_exact_and_forks_are_refused(make_env):
     assert [*branch(env, _played_out, 2), _played_out(env)] == [by_its_rule(3)] * 3
 
 
-def test_other_futures_are_drawn_in_the_process(make_env):
+def test_process_simulation_draws_other_futures_by_reseed(make_env):
     env = _begun(make_env(aec_env, reservoirs()), 5)
     one, again, other = branch(env, _played_out, 3, seeds=[1, 1, 2])
     assert one == again != other
 
 
-def test_process_that_cannot_reseed_raises_an_error():
+def test_process_simulation_that_cannot_reseed_raises_an_error():
     simulation = begun(
         ProcessSimulation([sys.executable, outside.__file__, "bare", "rate"], {"rate": PLAIN}), 1
     )
@@ -251,7 +251,7 @@ def _patient(words, timeout=30.0):
     return ProcessSimulation(words, BOTH, timeout=timeout)
 
 
-def test_many_simulations_share_a_process(started, make_env, tmp_path):
+def test_process_simulation_shares_one_process_among_many_runs(started, make_env, tmp_path):
     simulation, number = started
     evaluate(simulation, {"rule": {}, "cheap": {"broker.price": _cheap}}, seeds=range(5))
     assert number() == 1
@@ -267,7 +267,7 @@ def test_many_simulations_share_a_process(started, make_env, tmp_path):
     assert number() == 6
 
 
-def test_kept_process_ends_when_its_runner_returns_or_fails(started):
+def test_process_simulation_process_ends_with_simulate_many(started):
     numbers = []
 
     def notice(simulation):
@@ -283,7 +283,7 @@ def test_kept_process_ends_when_its_runner_returns_or_fails(started):
     assert not runs(numbers[-1])
 
 
-def test_an_environment_that_is_gone_takes_its_process_along():
+def test_process_simulation_process_ends_when_its_env_is_dropped():
     env = begun(aec_env(reservoirs()), 1)
     env.step(RULE)
     number = child(env)
@@ -293,7 +293,7 @@ def test_an_environment_that_is_gone_takes_its_process_along():
     assert not runs(number)
 
 
-def test_copies_are_made_of_the_same_and_have_processes_of_their_own(make_env):
+def test_process_simulation_copies_have_processes_of_their_own(make_env):
     env = begun(make_env(aec_env, reservoirs()), 1)
     other = aec_env(reservoirs({"broker.price": PRICE}, env=MappingProxyType({**os.environ})))
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(other))):
@@ -303,7 +303,7 @@ def test_copies_are_made_of_the_same_and_have_processes_of_their_own(make_env):
         twin.close()
 
 
-def test_calls_can_be_copied():
+def test_process_simulation_calls_can_be_copied_and_pickled():
     copies = []
 
     def look(call):
@@ -326,7 +326,7 @@ def test_calls_can_be_copied():
         call["rain"]
 
 
-def test_values_that_are_no_json_are_refused_before_sending(make_env):
+def test_process_simulation_refuses_values_that_are_no_json(make_env):
     env = begun(
         make_env(
             aec_env,
@@ -413,7 +413,7 @@ for line in commands:
     ],
     ids=str,
 )
-def test_time_is_known_from_any_kind_of_first_frame(first):
+def test_process_simulation_knows_the_time_from_the_first_frame(first):
     seen = []
 
     def observe(call):

@@ -14,7 +14,7 @@ from tests.worlds.models import follow_the_rule
 pytestmark = pytest.mark.skipif(bool(ros.missing()), reason=ros.missing())
 
 
-def test_rule_episodes_match_the_plain_run_after_aborted_ones(make_env):
+def test_ros_episodes_with_rule_actions_match_a_run_without_env(make_env):
     env, found = make_env(ros.env), []
     for seed in range(5):
         for _ in range(2):
@@ -31,7 +31,7 @@ def test_rule_episodes_match_the_plain_run_after_aborted_ones(make_env):
 
 
 @pytest.mark.greenlet("the driver makes no difference to the nodes")
-def test_a_policy_decides_and_all_nodes_end_with_the_environment(make_env):
+def test_ros_nodes_get_a_policys_decisions_and_end_with_the_env(make_env):
     env = make_env(ros.env)
     env.reset(seed=1)
     group = child(env)

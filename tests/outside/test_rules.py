@@ -32,7 +32,7 @@ def sampled(agent, env):
 
 
 @pytest.mark.parametrize("choose", [RULE, sampled], ids=["rule", "sampled"])
-def test_an_episode_is_the_one_of_the_same_model_in_this_process(make_env, choose):
+def test_process_simulation_episode_equals_the_model_in_this_process(make_env, choose):
     envs = make_env(aec_env, telling()), make_env(aec_env, Here)
     for seed in range(3):
         theirs, ours = (play(env, choose, seed=seed) for env in envs)
@@ -45,7 +45,7 @@ def _closes(observations):
     return np.zeros((len(observations), 1))
 
 
-def test_the_rule_can_be_recorded_and_compared_with_policies():
+def test_process_simulation_rule_can_be_compared_with_policies():
     found = [
         compare_with_rule(simulation, {name: _closes}, seeds=range(3), tolerance=0.5)[name]
         for simulation, name in ((telling(), "reservoir.inflow"), (Here, next(iter(Here.points))))
@@ -55,7 +55,7 @@ def test_the_rule_can_be_recorded_and_compared_with_policies():
     assert mixed["reservoir.inflow"].known.all()
 
 
-def test_rule_actions_are_unknown_if_the_process_sends_no_decided():
+def test_process_simulation_without_decided_frames_has_no_rule_actions():
     policies = {"broker_0": lambda observations: np.zeros(len(observations), int)}
     with pytest.raises(DefinitionError, match="the action of the rule is not known"):
         compare_with_rule(
@@ -63,7 +63,7 @@ def test_rule_actions_are_unknown_if_the_process_sends_no_decided():
         )
 
 
-def test_apply_may_return_the_decision_of_the_rule():
+def test_process_simulation_apply_can_return_the_rules_decision():
     asked, late = [], []
 
     def apply(action, call, *, _rule):
@@ -77,7 +77,7 @@ def test_apply_may_return_the_decision_of_the_rule():
     assert [rule(call) for rule, call in late] == [RULE] * len(asked), "no decision is due any more"
 
 
-def test_apply_cannot_replace_a_decision_of_the_rule():
+def test_process_simulation_apply_cannot_replace_the_rules_decision():
     definition = replace(
         PRICE, action_space_mapping=None, apply=lambda action, call, *, _rule: 2 * _rule(call)
     )
@@ -155,7 +155,7 @@ def speaking(*frames):
     ],
     ids=str,
 )
-def test_invalid_or_error_frames_before_the_start_are_errors(frames, kind, text):
+def test_process_simulation_raises_errors_of_frames_before_the_start(frames, kind, text):
     with pytest.raises(kind, match=text):
         simulate(speaking(*frames), seed=1)
 
@@ -171,7 +171,7 @@ def test_invalid_or_error_frames_before_the_start_are_errors(frames, kind, text)
     ],
     ids=str,
 )
-def test_wrong_frame_in_place_of_decided_is_named_in_an_error(frame, text):
+def test_process_simulation_error_names_a_frame_sent_instead_of_decided(frame, text):
     with pytest.raises(
         WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'
     ):
@@ -210,13 +210,13 @@ def test_wrong_frame_in_place_of_decided_is_named_in_an_error(frame, text):
     ],
     ids=str,
 )
-def test_invalid_or_unexpected_frame_is_named_in_an_error(frame, text):
+def test_process_simulation_error_names_an_unexpected_frame(frame, text):
     with pytest.raises(WireError, match=f"(?s){text}"):
         simulate(speaking(HELLO, CALL, DECIDED, frame), seed=1)
 
 
 @pytest.mark.parametrize("frame", [DECIDED, {"expect": []}])
-def test_frames_that_were_not_announced_are_errors(frame):
+def test_process_simulation_refuses_frames_that_were_not_announced(frame):
     with pytest.raises(WireError, match=r"not in the \"can\" of its hello"):
         simulate(speaking({**HELLO, "can": []}, CALL, frame), seed=1)
 
@@ -241,7 +241,9 @@ def test_frames_that_were_not_announced_are_errors(frame):
     ],
     ids=["one by one", "together", "in mid-episode"],
 )
-def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds):
+def test_process_simulation_expected_agents_act_in_one_parallel_step(
+    make_env, frames, born, rounds
+):
     env = begun(
         make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *frames, {"end": {}})), 1
     )
@@ -252,7 +254,7 @@ def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds
     assert not env.agents
 
 
-def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
+def test_process_simulation_expected_agents_observe_until_their_removal(make_env):
     first_day = [
         expected("a", "b"),
         call(1, "a"),
@@ -272,7 +274,7 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
     )
 
 
-def test_removed_entity_is_not_expected_and_its_name_may_return(make_env):
+def test_process_simulation_removed_agents_name_can_return(make_env):
     removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
     frames = CALL, DECIDED, expected("b"), *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
     names = {}
@@ -283,7 +285,7 @@ def test_removed_entity_is_not_expected_and_its_name_may_return(make_env):
     assert env.simulation.expected_calls("sheep.graze") == []
 
 
-def test_error_in_a_mapping_ends_a_process_that_is_not_waiting(make_env):
+def test_process_simulation_mapping_error_ends_a_busy_process(make_env):
     rewards = [0.0]
     once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
     removed = {"remove": "a", "point": "sheep.graze"}
@@ -294,7 +296,7 @@ def test_error_in_a_mapping_ends_a_process_that_is_not_waiting(make_env):
     assert not runs(number)
 
 
-def test_a_process_that_does_not_expect_has_no_expected_calls():
+def test_process_simulation_without_expect_has_no_expected_calls():
     simulation = reservoirs()
     assert not hasattr(simulation, "expected_calls")
     simulation.reset(seed=1)

@@ -30,7 +30,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_decoded_frames_equal_encoded_ones(value):
+def test_wire_frames_are_decoded_as_they_were_encoded(value):
     line = encode({"value": value})
     assert line.endswith(b"\n")
     assert line.count(b"\n") == 1
@@ -55,7 +55,7 @@ def test_decoded_frames_equal_encoded_ones(value):
         ("ä\n\ud800", '"\\u00e4\\n\\ud800"'),
     ],
 )
-def test_numbers_of_numpy_and_python_are_sent_as_json(value, sent):
+def test_wire_sends_numbers_of_numpy_and_python_as_json(value, sent):
     assert encode({"value": value}) == f'{{"value":{sent}}}\n'.encode()
 
 
@@ -76,7 +76,7 @@ ROUND.append(ROUND)
     ],
     ids=type,
 )
-def test_values_that_are_no_json_are_refused_with_their_place(value, text):
+def test_wire_refuses_values_that_are_no_json_and_names_their_place(value, text):
     with pytest.raises(WireError, match=text):
         encode({"value": value})
 
@@ -96,23 +96,23 @@ def test_values_that_are_no_json_are_refused_with_their_place(value, text):
     ],
     ids=range(9),
 )
-def test_invalid_lines_are_refused(line, text):
+def test_wire_refuses_invalid_lines(line, text):
     with pytest.raises(WireError, match=text):
         decode(line)
 
 
-def test_objects_that_are_no_numbers_stay_as_they_are():
+def test_wire_decodes_objects_that_only_look_like_numbers_unchanged():
     frame = {"a": {"float": 3}, "b": {"float": "nan", "more": 1}}
     assert decode(json.dumps(frame).encode()) == frame
 
 
-def test_the_page_shows_frames_that_the_wire_has():
+def test_wire_page_of_the_docs_shows_existing_frames():
     text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
     shown = [decode(line.encode()) for line in re.findall("^(?:->|<-)  (.*)$", text, re.MULTILINE)]
     assert {next(iter(frame)) for frame in shown} == {*KEYS, "start", "act", "reseed", "stop"}
 
 
-def test_an_episode_that_does_not_end_is_broken_off():
+def test_wire_check_aborts_an_episode_that_does_not_end():
     report = check_wire(command(), options=MappingProxyType({"hours": 10_000}), decisions=20)
     assert report.ok
     assert report.findings[1].verdict == "note"
@@ -293,7 +293,7 @@ def test_wire_check_notes_behaviour_that_may_be_intended(tmp_path, monkeypatch):
     assert "exits with code 0 after an episode, and plays the same in a new process" in noted[TWO]
 
 
-def test_the_command_wire_check_reports_and_exits(capsys):
+def test_wire_check_command_reports_and_exits_with_a_status(capsys):
     assert main(["wire-check", "--seed", "3", "--", *command()]) == 0
     assert "nothing is wrong" in capsys.readouterr().out
     assert main(["wire-check", "--json", "--options", '{"hours": 3}', *command()]) == 0

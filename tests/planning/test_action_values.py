@@ -99,7 +99,7 @@ class Limited(Duel):
 @METHODS
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_values_are_the_same_in_every_view_and_driver(view, driver, method):
+def test_action_values_are_the_same_in_every_env_and_driver(view, driver, method):
     if driver == "thread" and method == "fork":
         method = None  # which is then a replay
     env = made(view, Limited, driver=driver)
@@ -115,7 +115,7 @@ def test_values_are_the_same_in_every_view_and_driver(view, driver, method):
 
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
-def test_values_in_mid_episode_belong_to_the_pending_decision(view):
+def test_action_values_in_mid_episode_belong_to_the_pending_decision(view):
     env = made(view)
     for agent in ("left", "right", "left"):
         env.step(1 if view == "aec" else {agent: 1})
@@ -140,7 +140,7 @@ def test_values_in_mid_episode_belong_to_the_pending_decision(view):
     ],
 )
 @pytest.mark.parametrize("view", [*VIEWS, "joint"])
-def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
+def test_action_values_horizon_counts_the_agents_decisions_or_time(view, given, told):
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
     value = {"terminal_value": lambda env: np.array([10 + env.simulation.value])}
@@ -154,7 +154,7 @@ def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, 
 @pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_base_is_a_policy_of_the_agent_or_policies_by_agent(view, method):
+def test_action_values_base_is_one_policy_or_policies_by_agent(view, method):
     env, given = made(view), [(greedy, {"left": greedy})]
     if view in ("aec", "parallel"):
         given += [(BASES, BASES), (BASES | {"left": RULE}, {"right": down})]
@@ -168,7 +168,7 @@ def test_the_base_is_a_policy_of_the_agent_or_policies_by_agent(view, method):
 
 
 @METHODS
-def test_joint_views_sum_up_and_have_joint_bases(method):
+def test_action_values_in_joint_env_sum_rewards_and_take_joint_bases(method):
     env = made("joint")
     actions, first = (
         [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}],
@@ -196,7 +196,7 @@ def test_joint_views_sum_up_and_have_joint_bases(method):
     assert action_values(env, actions, futures=3, method=method).returns == pytest.approx(-table)
 
 
-def test_policies_of_the_environment_take_precedence_over_the_base():
+def test_action_values_prefer_the_envs_policies_to_the_base():
     stays = {"right": lambda observation: 2}
     env = made("aec", policies=stays)
     for base in (RULE, {"left": RULE, "right": lambda observation: 0}):
@@ -234,7 +234,7 @@ GRAZING = {
 @pytest.mark.parametrize(
     ("make", "others"), [(single_env, 1 + 3 + 5), (aec_env, 1 + 3 + 5), (parallel_env, 1 + 2 + 4)]
 )
-def test_base_by_agent_decides_for_other_agents_of_the_same_point(make, others, method):
+def test_action_values_base_by_agent_decides_for_other_agents_too(make, others, method):
     """In a round by what they saw before it; in that in which they join, by the rule."""
     options = {"agent": "one"} if make is single_env else {}
     env = begun(make(Herd, GRAZING, **options), 1)
@@ -278,7 +278,7 @@ def test_action_values_are_exact_if_the_agent_ends_in_a_future(view, padded, met
     assert action_values(env, **given, horizon=5).means.max() < 1e3
 
 
-def test_futures_are_fixed_by_the_pending_decision_unless_seeded():
+def test_action_values_use_the_same_futures_at_the_same_decision():
     env = made("single")
 
     def returns(env, **given):
@@ -299,7 +299,7 @@ def test_futures_are_fixed_by_the_pending_decision_unless_seeded():
 @METHODS
 @pytest.mark.parametrize("model", [Duel, Unseeded])
 @pytest.mark.filterwarnings("ignore:Unseeded cannot draw")
-def test_random_base_draws_the_same_numbers_for_all_candidates(model, method):
+def test_action_values_random_base_draws_the_same_for_all_actions(model, method):
     def draws(observation):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 
@@ -322,7 +322,7 @@ def test_random_base_draws_the_same_numbers_for_all_candidates(model, method):
 
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
-def test_simulation_without_reseed_has_one_future_and_a_warning(view, method):
+def test_action_values_warn_of_a_model_without_reseed(view, method):
     env = made(view, Unseeded)
     with pytest.warns(
         UserWarning, match="Unseeded cannot draw new random numbers .* foresees"
@@ -336,7 +336,7 @@ def test_simulation_without_reseed_has_one_future_and_a_warning(view, method):
     )
 
 
-def test_samples_for_wrappers_leave_the_action_space_generator_alone():
+def test_action_values_do_not_draw_from_the_envs_action_space():
     space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
     env = begun(TransformAction(made("joint"), lambda action: action, space))
     drawn = copy.deepcopy(env.action_space["right"].np_random)
@@ -344,7 +344,7 @@ def test_samples_for_wrappers_leave_the_action_space_generator_alone():
     assert env.action_space["right"].np_random.random() == drawn.random()
 
 
-def test_planning_includes_wrappers_of_single_views():
+def test_action_values_apply_wrappers_of_single_env():
     env = made("single")
     table = expected(env, "left", horizon=3)
     limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
@@ -377,7 +377,7 @@ class Doubled(BaseParallelWrapper):
 
 
 @METHODS
-def test_planning_includes_pettingzoo_wrappers_and_gives_legal_actions(method):
+def test_action_values_apply_pettingzoo_wrappers(method):
     env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
@@ -427,7 +427,7 @@ def test_action_values_refuse_invalid_arguments(view, given, error, match):
     assert action_values(env, futures=1).best == 2  # nothing has come of it
 
 
-def test_an_agent_that_has_ended_must_step_before_another_one_plans():
+def test_action_values_refuse_aec_env_while_a_dead_agent_must_step():
     env = made("aec", Mortal)
     while env.agent_selection == "right" or not env.terminations["left"]:
         env.step(2)
@@ -437,13 +437,13 @@ def test_an_agent_that_has_ended_must_step_before_another_one_plans():
     assert action_values(env, futures=2).best == 2
 
 
-def test_only_environments_of_one_simulation_can_be_planned_in():
+def test_action_values_refuse_vector_env():
     for other in (vector_env(Duel, {LEFT: points()[LEFT]}, num_envs=2), Duel()):
         with pytest.raises(ViewError, match="one simulation"):
             action_values(other)
 
 
-def test_candidates_must_be_listed_unless_they_are_discrete():
+def test_action_values_need_a_list_of_actions_unless_they_are_discrete():
     amount = points(action_space=spaces.Box(0, 2, (1,), np.float64), action_space_mapping=np.sum)
     env = begun(single_env(Duel, {LEFT: amount[LEFT]}))
     for other in (env, made("joint")):
@@ -455,7 +455,7 @@ def test_candidates_must_be_listed_unless_they_are_discrete():
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
-def test_masked_candidates_are_left_out(wrapper):
+def test_action_values_omit_masked_actions(wrapper):
     given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
     env = begun(wrapper(single_env(Duel, {LEFT: given[LEFT]})))
     assert action_values(env, futures=2).actions == (0, 1)
@@ -470,7 +470,7 @@ def test_masked_candidates_are_left_out(wrapper):
             RolloutPolicy(actions).choose(env)
 
 
-def test_a_time_limit_ends_branches_that_hang():
+def test_action_values_time_limit_ends_branches_that_hang():
     with pytest.raises(BranchError, match="longer than"):
         action_values(
             made("single"), futures=1, base=lambda observation: time.sleep(60), time_limit=0.2
@@ -482,7 +482,7 @@ def test_action_values_show_progress_on_request(capsys):
     assert "9/9" in capsys.readouterr().err
 
 
-def test_branches_are_not_rendered():
+def test_action_values_do_not_render_branches():
     class Shown(Duel):
         render_modes = ("human",)
         pictures = 0
@@ -499,7 +499,7 @@ def test_branches_are_not_rendered():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
-def test_rewards_of_rounds_without_the_agent_count_for_its_last_decision(wrapper):
+def test_action_values_count_rewards_of_steps_without_the_agent(wrapper):
     class Unannounced(Duel):
         def expected_calls(self, point):
             return []
@@ -520,7 +520,7 @@ def high(observation):
     [("aec", 1), ("parallel", 1), ("turn", 1), ("joint", {"left": 1, "right": 1})],
     ids=str,
 )
-def test_planner_used_as_the_base_of_another_agent_acts_by_its_own_base(view, candidate):
+def test_rollout_policy_as_a_base_acts_by_its_own_base(view, candidate):
     plain, planned = (
         action_values(made(view), [candidate], base={"right": base}, futures=1).means.tolist()
         for base in (high, RolloutPolicy(base=high))
@@ -550,7 +550,7 @@ def with_base(base):
     ],
 )
 @pytest.mark.parametrize("view", [*VIEWS, "joint", "turn"])
-def test_planners_without_a_base_are_refused_as_bases(view, base):
+def test_action_values_refuse_a_planning_policy_without_a_base_as_base(view, base):
     env = made(view)
     if view == "single" and isinstance(base, dict):
         base = {"left": base["right"]}  # the only agent
@@ -564,7 +564,7 @@ def test_planners_without_a_base_are_refused_as_bases(view, base):
 
 
 @METHODS
-def test_errors_in_futures_keep_their_type_and_note_the_candidate(method):
+def test_action_values_errors_keep_their_type_and_name_the_action(method):
     class Fragile(Duel):
         def run(self):
             return 1 / (self.left() - 2)

@@ -95,14 +95,14 @@ def one_agent(model=Works, **changes):
 
 @pytest.mark.parametrize("horizon", [0.25, 3.0, 8.5])
 @pytest.mark.parametrize("make", [watched, aec_env, parallel_env, turn_env])
-def test_actions_of_equal_worth_have_equal_means(make, horizon):
+def test_action_values_of_equivalent_actions_have_equal_means(make, horizon):
     alone = {OPERATE: points()[OPERATE]}
     env = watched("aec") if make is watched else begun(make(Works, alone))
     told = action_values(env, futures=4, horizon=horizon, horizon_by="time", method="replay")
     assert told.returns == pytest.approx(-horizon)
 
 
-def test_a_horizon_counts_the_share_of_the_last_interval():
+def test_action_values_horizon_counts_a_share_of_the_last_time_interval():
     env = one_agent(cost=lambda works: works.clock**2)
     told = action_values(env, [7], futures=3, horizon=2.0, horizon_by="time", method="replay")
     seen = action_values(env, [7], futures=3, horizon=1, method="replay")
@@ -111,13 +111,13 @@ def test_a_horizon_counts_the_share_of_the_last_interval():
 
 
 @pytest.mark.parametrize("view", ["single", "aec"])
-def test_a_horizon_is_exact_where_another_agent_decides(view):
+def test_action_values_horizon_can_end_while_another_agent_decides(view):
     env = watched(view, cost=lambda works: works.clock**2)
     told = action_values(env, [7], futures=3, horizon=2.0, horizon_by="time", method="replay")
     assert told.returns == pytest.approx(-4.0)
 
 
-def test_a_terminal_value_counts_the_last_interval_in_full():
+def test_action_values_with_terminal_value_count_the_last_interval_in_full():
     env = one_agent()
     given = {"futures": 3, "terminal_value": lambda env: 100.0, "method": "replay"}
     told = action_values(env, [7], horizon=2.0, horizon_by="time", **given)
@@ -126,7 +126,7 @@ def test_a_terminal_value_counts_the_last_interval_in_full():
 
 @METHODS
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_a_metric_takes_the_place_of_rewards(driver, method):
+def test_action_values_metric_replaces_rewards(driver, method):
     if driver == "thread" and method == "fork":
         method = None
     env = begun(single_env(Works, {OPERATE: points()[OPERATE]}, driver=driver))
@@ -152,7 +152,7 @@ def _seeds(env, number):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, turn_env])
-def test_a_metric_is_read_in_every_view(make):
+def test_action_values_metric_works_in_every_env(make):
     env = begun(make(Works, {OPERATE: points()[OPERATE]}))
     actions = [{"machine": 7}] if make is joint_env else [7]
     told = action_values(env, actions, metric=lambda works: works.clock, futures=2)
@@ -162,14 +162,14 @@ def test_a_metric_is_read_in_every_view(make):
         assert told.returns.tolist() == alone.returns.tolist()
 
 
-def test_branches_do_not_warn_of_lost_actions():
+def test_action_values_do_not_warn_of_unused_actions_in_branches():
     env = begun(joint_env(Works, points()))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         action_values(env, [lambda seen: {"machine": 4, "watchman": 0}], hold=None, method="replay")
 
 
-def test_a_metric_is_interpolated_at_a_horizon():
+def test_action_values_metric_is_interpolated_at_the_horizon():
     env = one_agent()
     given = {"futures": 3, "horizon_by": "time", "method": "replay"}
     told = action_values(env, [7, 2], metric=lambda works: works.clock, horizon=2.5, **given)
@@ -201,11 +201,11 @@ def logs(env, candidates, **given):
         ({"hold": 3, "horizon": 5}, "22211"),
     ],
 )
-def test_a_candidate_decides_as_long_as_it_is_held(given, expected):
+def test_action_values_hold_repeats_an_action_for_some_decisions(given, expected):
     assert logs(one_agent(), [1], **given) == [expected]
 
 
-def test_a_candidate_is_held_for_a_time():
+def test_action_values_hold_time_repeats_an_action_for_a_time():
     env = one_agent()
     [short] = logs(env, [1], hold=1e-9, hold_by="time")
     [long] = logs(env, [1], hold=6.0, hold_by="time")
@@ -214,7 +214,7 @@ def test_a_candidate_is_held_for_a_time():
     assert long.endswith("111")
 
 
-def test_policies_and_the_rule_are_candidates():
+def test_action_values_accept_policies_and_the_rule_as_actions():
     def three(observation):
         return 2
 
@@ -225,7 +225,7 @@ def test_policies_and_the_rule_are_candidates():
     ]  # fmt: skip
 
 
-def test_policies_get_the_simulation_of_their_branch():
+def test_action_values_policies_get_the_simulation_of_their_branch():
     env = one_agent()
     own, seen = env.unwrapped.simulation, []
 
@@ -238,7 +238,7 @@ def test_policies_get_the_simulation_of_their_branch():
     assert all(isinstance(works, Works) and works is not own for works in seen)
 
 
-def test_illegal_candidates_are_refused_before_anything_moves():
+def test_action_values_refuse_illegal_actions_before_they_branch():
     env = one_agent()
     for wrong in (8, first(8, RULE), "fast"):
         with pytest.raises(InvalidActionError, match="not in"):
@@ -252,7 +252,7 @@ def test_illegal_candidates_are_refused_before_anything_moves():
         action_values(env, [1], metric=lambda works: "good", futures=1, method="replay")
 
 
-def test_a_callable_proposes_candidates():
+def test_rollout_policy_takes_a_callable_that_proposes_actions():
     asked = []
 
     def propose(observation, info, *, _decision, _incumbent, _simulation):
@@ -272,7 +272,7 @@ def test_a_callable_proposes_candidates():
 
 
 @pytest.mark.thorough
-def test_box_candidates_search_around_the_incumbent():
+def test_rollout_policy_tries_box_actions_around_its_last_choice():
     space = spaces.Box(0.5, 8.0, (1,), np.float64)
     changes = {"action_space": space, "action_space_mapping": lambda action: float(action[0])}
 
@@ -308,7 +308,7 @@ def patient(**given):
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_every_option_keeps_the_choice_between_planned_decisions(driver):
+def test_rollout_policy_every_repeats_its_choice_between_plans(driver):
     planned = []
 
     class Counting(RolloutPolicy):
@@ -325,7 +325,7 @@ def test_every_option_keeps_the_choice_between_planned_decisions(driver):
 
 
 @pytest.mark.thorough
-def test_the_incumbent_stays_a_candidate_while_it_is_held():
+def test_rollout_policy_tries_its_last_choice_again():
     env = one_agent()
     planner = patient(hold=3)
     planner.actions = lambda observation: [long] if observation[0] == 0.0 else [short]
@@ -340,7 +340,7 @@ def test_the_incumbent_stays_a_candidate_while_it_is_held():
 
 @pytest.mark.thorough
 @METHODS
-def test_clones_take_the_incumbent_along(method):
+def test_clone_keeps_the_last_choice_of_a_rollout_policy(method):
     env = one_agent()
     planner = patient(hold=None, every=2)
     assert planner.choose(env).best is long
@@ -354,7 +354,7 @@ def test_clones_take_the_incumbent_along(method):
 
 @pytest.mark.thorough
 @METHODS
-def test_clones_go_on_with_the_choices_of_planners_in_policies(method):
+def test_clone_keeps_the_last_choices_of_rollout_policies_in_policies(method):
     planner = RolloutPolicy([short, long], futures=2, metric=lambda works: works.clock, every=3)
     env = begun(single_env(Works, points(), agent="watchman", policies={"machine": planner}))
     for _ in range(4):
@@ -370,7 +370,7 @@ def test_clones_go_on_with_the_choices_of_planners_in_policies(method):
     assert len(set(logs[0])) > 1
 
 
-def test_a_new_episode_has_no_incumbent():
+def test_rollout_policy_forgets_its_last_choice_in_a_new_episode():
     env = one_agent()
     planner = patient()
     planner.choose(env)
@@ -379,7 +379,7 @@ def test_a_new_episode_has_no_incumbent():
     assert planner.choose(env).actions == (short, RULE)
 
 
-def test_planner_keeps_rule_or_incumbent_over_worse_candidates():
+def test_rollout_policy_keeps_the_rule_or_last_choice_over_worse_actions():
     env = one_agent()
     planner = patient(hold=None)
     planner.choose(env)
@@ -402,7 +402,7 @@ class Fixed(Works):
 
 
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_a_deterministic_model_has_one_future_and_no_warning(kind):
+def test_action_values_of_a_deterministic_model_use_one_future(kind):
     env = begun(single_env(Fixed, {OPERATE: points()[OPERATE]}))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -414,7 +414,7 @@ def test_a_deterministic_model_has_one_future_and_no_warning(kind):
 # -- tree search ----------------------------------------------------------------------------------
 
 
-def test_a_tree_branches_at_the_end_of_a_hold():
+def test_tree_search_policy_branches_after_each_held_action():
     env = begun(single_env(Fixed, {OPERATE: points()[OPERATE]}))
     found = set()
 

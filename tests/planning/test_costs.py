@@ -57,7 +57,9 @@ RUNS = {
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_long_run_reports_the_cost_of_a_decision_once(run, tmp_path, monkeypatch, capfd):
+def test_simulate_many_reports_once_how_long_a_planning_decision_takes(
+    run, tmp_path, monkeypatch, capfd
+):
     monkeypatch.setattr(costs, "LONG", 0.01)
     RUNS[run](tmp_path)
     said = SAID.findall(capfd.readouterr().err)
@@ -79,7 +81,7 @@ def stop(simulation):
 
 
 @pytest.mark.thorough
-def test_long_run_in_workers_reports_the_cost_once(capfd):
+def test_simulate_many_with_workers_reports_planning_time_once(capfd):
     planner = RolloutPolicy([[0, 1], [1, 0]], futures=1, budget=5, every=12)
     # Workers of other tests would print elsewhere.
     joblib.externals.loky.get_reusable_executor().shutdown(wait=True)
@@ -92,7 +94,7 @@ def test_long_run_in_workers_reports_the_cost_once(capfd):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_all_planners_report_the_cost_of_a_decision(kind, monkeypatch, capfd):
+def test_every_planning_policy_reports_how_long_a_decision_takes(kind, monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.01)
     planner = kind([[0, 1], [1, 0]], futures=4, horizon=2, every=6)
     simulate_many(Chance, {"push": planner}, seeds=[1, 2])
@@ -100,7 +102,7 @@ def test_all_planners_report_the_cost_of_a_decision(kind, monkeypatch, capfd):
     assert (candidates, futures) == ("3", "4")
 
 
-def test_short_runs_and_single_simulations_report_no_cost(monkeypatch, capfd):
+def test_short_runs_and_simulate_report_no_planning_time(monkeypatch, capfd):
     simulate_many(Slow, POLICIES, seeds=[1])
     monkeypatch.setattr(costs, "LONG", 0.0)
     simulate(Slow, POLICIES, seed=1)
@@ -108,7 +110,7 @@ def test_short_runs_and_single_simulations_report_no_cost(monkeypatch, capfd):
 
 
 @pytest.mark.parametrize(("method", "seconds"), [("fork", "3 s"), ("replay", "8 s")])
-def test_reported_cost_of_a_replay_includes_half_of_the_past(method, seconds, monkeypatch, capfd):
+def test_reported_planning_time_of_replays_includes_the_past(method, seconds, monkeypatch, capfd):
     monkeypatch.setattr(costs, "LONG", 0.0)
     future = costs.Future(decisions=10, seconds=10.0, time=10.0, is_over=True)
     monkeypatch.setattr(costs, "_time_future", lambda env, number, base: future)
@@ -117,7 +119,7 @@ def test_reported_cost_of_a_replay_includes_half_of_the_past(method, seconds, mo
     assert f"3 candidates x 1 futures x {seconds} on " in capfd.readouterr().err
 
 
-def test_measuring_the_cost_of_a_decision_does_not_change_results(monkeypatch, capfd):
+def test_measuring_planning_time_does_not_change_results(monkeypatch, capfd):
     before = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]
     monkeypatch.setattr(costs, "LONG", 0.0)
     after = [simulation.level.tolist() for simulation in simulate_many(Slow, POLICIES, seeds=[4])]
@@ -127,7 +129,7 @@ def test_measuring_the_cost_of_a_decision_does_not_change_results(monkeypatch, c
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("run", RUNS)
-def test_bars_show_the_remaining_time(run, tmp_path, capfd):
+def test_progress_bar_shows_the_remaining_time(run, tmp_path, capfd):
     RUNS[run](tmp_path, progress=True)
     bars = re.findall(r"(\d+)/\d+ \[\d+:\d+<(\d+:\d+|\?)", capfd.readouterr().err)
     assert bars[-1][1] != "?"

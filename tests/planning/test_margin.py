@@ -70,13 +70,13 @@ def share_of_rule(kind, model, margin, decisions):
     return sum(answer is RULE for answer in answers) / decisions
 
 
-def test_margin_rarely_lets_a_candidate_win_by_chance_alone():
+def test_rollout_policy_margin_rarely_lets_an_action_win_by_chance():
     assert share_of_rule(RolloutPolicy, world(shared=True), 4.0, 12) >= 0.9
     assert 0.2 <= share_of_rule(RolloutPolicy, world(shared=True), 0.0, 12) <= 0.85
 
 
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_candidates_no_better_than_the_rule_are_not_taken(kind):
+def test_rollout_policy_keeps_the_rule_unless_an_action_is_better(kind):
     assert share_of_rule(kind, world(gain=0.01), 1.0, 3) == 0.0  # the same noise meets all
     assert share_of_rule(kind, world(gain=-0.01), 0.0, 3) == 1.0
     assert share_of_rule(kind, world(), 0.0, 3) == 1.0
@@ -85,7 +85,7 @@ def test_candidates_no_better_than_the_rule_are_not_taken(kind):
 @pytest.mark.thorough
 @pytest.mark.parametrize(("futures", "fresh"), [(3, 8), (12, 12)])
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
-def test_best_candidate_is_compared_with_the_rule_on_fresh_futures(
+def test_rollout_policy_compares_its_best_action_on_fresh_futures(
     kind, futures, fresh, monkeypatch
 ):
     calls, branch = [], rollouts.branch
@@ -108,7 +108,7 @@ def test_best_candidate_is_compared_with_the_rule_on_fresh_futures(
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", [RolloutPolicy, TreeSearchPolicy])
 @pytest.mark.filterwarnings("ignore:SomeWorld cannot draw")
-def test_margin_is_ignored_if_there_is_one_exact_future(kind):
+def test_rollout_policy_ignores_its_margin_if_the_model_is_deterministic(kind):
     for gain, best in ((1e-6, 1), (0.0, RULE), (-1e-6, RULE)):
         assert (
             kind(actions=[1, 0], horizon=1, margin=1e9)
@@ -118,7 +118,7 @@ def test_margin_is_ignored_if_there_is_one_exact_future(kind):
         )
 
 
-def test_returns_correlate_as_far_as_candidates_share_chance():
+def test_action_values_report_how_returns_of_actions_correlate():
     def correlation(model, **given):
         return action_values(
             made(model), horizon=1, **{"futures": 15, "method": "replay"} | given
@@ -171,7 +171,7 @@ DOUBTFUL = [
 
 
 @pytest.mark.parametrize(("match", "model", "options", "given"), DOUBTFUL)
-def test_uninformative_futures_are_warned_of_once(match, model, options, given):
+def test_action_values_warn_once_of_futures_that_tell_nothing(match, model, options, given):
     env = made(model, **options)
     with pytest.warns(UserWarning, match=match) as caught:
         action_values(env, **{"futures": 16, "horizon": 1, "method": "replay"} | given)
@@ -182,7 +182,7 @@ def test_uninformative_futures_are_warned_of_once(match, model, options, given):
 
 @pytest.mark.parametrize(("model", "given"), SOUND)
 @pytest.mark.filterwarnings("ignore:SomeWorld cannot draw")
-def test_sound_futures_are_not_warned_of(model, given):
+def test_action_values_do_not_warn_of_informative_futures(model, given):
     env = made(model)
     for _ in range(2):
         action_values(env, **{"futures": 16, "horizon": 1, "method": "replay"} | given)

@@ -89,7 +89,7 @@ def wide():
     return begun(single_env(Wide, Wide.choose), 1)
 
 
-def test_the_budget_is_divided_among_rounds(wide):
+def test_rollout_policy_spends_more_of_its_budget_on_better_actions(wide):
     told = RolloutPolicy([*range(8), RULE], budget=96, method="replay").choose(wide)
     assert told.actions == RolloutPolicy(budget=96).choose(wide).actions == (*range(8), RULE)
     assert sorted(told.counts.tolist()) == [2, 2, 2, 2, 7, 7, 15, 29, 29]
@@ -107,13 +107,13 @@ def test_the_budget_is_divided_among_rounds(wide):
         ({"actions": [1, 4, 2], "futures": 6}, 24),
     ],
 )
-def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
+def test_rollout_policy_spends_its_budget_and_no_more(wide, given, budget):
     counts = RolloutPolicy(method="replay", **given).choose(wide).counts
     assert budget - 1 <= counts.sum() <= budget
     assert counts.min() >= 1
 
 
-def test_rollout_candidates_of_a_budget_round_share_their_futures(wide):
+def test_rollout_policy_tries_actions_of_a_round_in_the_same_futures(wide):
     told = RolloutPolicy([2, 2, 2, RULE], budget=32, method="replay").choose(wide)
     assert told.counts.tolist() == [12, 12, 4, 4]
     assert told.returns[0].tolist() == told.returns[1].tolist()
@@ -125,7 +125,7 @@ def test_rollout_candidates_of_a_budget_round_share_their_futures(wide):
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
+def test_planning_policies_in_simulate_choose_the_actions_of_a_reference(driver, key, method):
     policy = planner(method=None if driver == "thread" and method == "fork" else method)
     found = simulate(Duel, {key: policy}, points=tame(), seed=5, driver=driver)
     answers, value = by_hand()
@@ -135,7 +135,7 @@ def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
 
 @METHODS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env, turn_env])
-def test_planners_decide_in_environments_as_by_hand(make, method):
+def test_planning_policies_in_envs_choose_the_best_actions_of_a_reference(make, method):
     env = begun(make(Duel, tame(), policies={"left": planner(method=method)}))
     while not step(env, 1, "right"):
         pass
@@ -146,7 +146,7 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
 @pytest.mark.parametrize(
     ("down", "method", "batch_size"), [(False, "replay", 1), (True, "replay", 8), (True, "fork", 8)]
 )
-def test_planners_in_simulate_many_decide_row_by_row(down, method, batch_size):
+def test_planning_policies_in_simulate_many_decide_one_by_one(down, method, batch_size):
     """Beside policies that are asked in batches, also in branches."""
     given = {
         "points": tame(),
@@ -170,7 +170,7 @@ def test_planners_in_simulate_many_decide_row_by_row(down, method, batch_size):
     assert all(len(of_agent) == 12 for of_agent in found.values())
 
 
-def test_planners_can_be_compared_with_the_rule():
+def test_compare_with_rule_accepts_planning_policies():
     given = {"points": tame(), "seeds": [5, 6]}
     told = compare_with_rule(Duel, {"left": planner(method="replay")}, **given)["left"]
     env, wanted = single_env(Duel, given["points"], agent="left"), []
@@ -185,7 +185,7 @@ def test_planners_can_be_compared_with_the_rule():
 
 
 @pytest.mark.thorough
-def test_planners_decide_in_vector_environments():
+def test_planning_policies_decide_in_vector_env():
     envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
         envs.step(np.array([1, 1]))
@@ -193,7 +193,7 @@ def test_planners_decide_in_vector_environments():
     envs.close()
 
 
-def test_max_steps_end_the_branch_of_an_agent_only_if_no_other_takes_steps():
+def test_max_steps_ends_a_policys_branch_unless_other_agents_take_steps():
     def to_the_end(twin, number):
         taken = 1
         while not any(over := twin.step(1)[2:4]):
@@ -215,7 +215,7 @@ def test_max_steps_end_the_branch_of_an_agent_only_if_no_other_takes_steps():
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_a_policy_gets_the_environment_with_its_decision_pending(many):
+def test_policy_with_environment_parameter_gets_env_at_its_decision(many):
     seen = []
 
     def tried(twin, action):
@@ -260,7 +260,7 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
             assert came_to == min(turn + 1, 5)
 
 
-def test_each_entity_plans_for_its_own_return():
+def test_rollout_policy_plans_for_the_return_of_its_own_agent():
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(
         Herd, {point: RolloutPolicy(futures=1, method="replay")}, points=GRAZING, seed=1
@@ -270,7 +270,7 @@ def test_each_entity_plans_for_its_own_return():
 
 @pytest.mark.thorough
 @METHODS
-def test_policies_that_branch_do_not_recurse_into_each_other(method):
+def test_planning_policies_do_not_plan_inside_each_others_branches(method):
     """In a branch of one agent, the other follows its base or its rule: branches do not nest."""
     calls, seen, plans = [], [], []
 
@@ -342,7 +342,7 @@ def choice(planner, model=Lock, given=None):
 
 @METHODS
 @pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
-def test_tree_search_finds_two_decisions_that_pay_only_together(method):
+def test_tree_search_policy_finds_two_decisions_that_pay_only_together(method):
     tree = TreeSearchPolicy(futures=10, exploration=1.4, method=method)
     rollouts = RolloutPolicy(futures=2, method=method)
     told = choice(tree)
@@ -358,7 +358,7 @@ def test_tree_search_finds_two_decisions_that_pay_only_together(method):
 
 
 @pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
-def test_tree_search_leaves_masked_later_actions_to_the_base():
+def test_tree_search_policy_leaves_masked_later_actions_to_its_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
     told = choice(TreeSearchPolicy(futures=10), given=given)
     assert (told.best, told.counts.sum()) == (RULE, 50)
@@ -392,7 +392,9 @@ class Lends(Unseeded):
     ("model", "most", "cost"),
     [(Opens, 200, 0), (Lends, 200, 0), (Unseeded, 3, 0), (Unseeded, 200, 1e9)],
 )
-def test_states_cached_by_a_search_change_no_value_and_are_closed(model, most, cost, monkeypatch):
+def test_tree_search_policy_closes_its_clones_and_keeps_exact_values(
+    model, most, cost, monkeypatch
+):
     twins = []
 
     def noted(*given, **options):
@@ -416,7 +418,7 @@ def test_states_cached_by_a_search_change_no_value_and_are_closed(model, most, c
 
 
 @pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
-def test_tree_searches_count_the_rewards_of_wrappers(monkeypatch):
+def test_tree_search_policy_counts_rewards_changed_by_wrappers(monkeypatch):
     monkeypatch.setattr(tree, "perf_counter", partial(next, count(0, 0)))  # forks cost nothing
     env = begun(TransformReward(made("single", Unseeded), lambda reward: -reward))
     found, replayed = (
@@ -427,7 +429,7 @@ def test_tree_searches_count_the_rewards_of_wrappers(monkeypatch):
     assert found.best == replayed.best
 
 
-def test_tree_search_works_if_the_agent_ends_before_the_depth():
+def test_tree_search_policy_works_if_the_agent_ends_before_its_depth():
     class Short(Duel):
         ceiling = 2.5
 
@@ -452,7 +454,7 @@ def far_sighted(observation, *, _environment):
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
 @pytest.mark.parametrize("policy", [TreeSearchPolicy(depth=5, futures=8), far_sighted])
-def test_policies_plan_and_play_clones_up_to_the_end(policy, monkeypatch):
+def test_planning_policies_work_in_clones_up_to_the_end(policy, monkeypatch):
     monkeypatch.setattr(tree, "perf_counter", partial(next, count(0, 0)))  # forks cost nothing
 
     class Short(Unseeded):
@@ -476,7 +478,7 @@ def test_policies_plan_and_play_clones_up_to_the_end(policy, monkeypatch):
         over = any(single.step(action)[2:4])
 
 
-def test_tree_search_candidates_share_their_futures():
+def test_tree_search_policy_tries_actions_in_the_same_futures():
     env = made("single")
     table = TreeSearchPolicy([1, 1], depth=1, futures=6).choose(env).returns
     both = ~np.isnan(table).any(axis=0)
@@ -495,7 +497,7 @@ def test_tree_search_candidates_share_their_futures():
         ("margin", [-1, float("nan"), None]),
     ],
 )
-def test_planners_refuse_invalid_options(option, values):
+def test_rollout_and_tree_search_policy_refuse_invalid_options(option, values):
     for value in values:
         with pytest.raises(OptionValueError, match=option):
             TreeSearchPolicy(**{option: value})

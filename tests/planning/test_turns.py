@@ -46,7 +46,7 @@ def rising(seen, info):
 @pytest.mark.parametrize(
     "given", [{}, {"horizon": 1}, {"horizon": 4, "discount": 0.5}, {"discount": 0.9}]
 )
-def test_values_match_clones_that_are_stepped_by_hand(base, given, method):
+def test_action_values_in_turn_env_match_clones_stepped_by_hand(base, given, method):
     env = made()
     for _ in range(3):  # up to a decision of the one on the right
         env.step(2)
@@ -66,7 +66,7 @@ def test_values_match_clones_that_are_stepped_by_hand(base, given, method):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("flatten", [False, True])
-def test_values_with_births_and_deaths_match_stepping_by_hand(flatten):
+def test_action_values_in_turn_env_with_births_match_stepping_by_hand(flatten):
     class Yard(random_worlds.Yard):
         def reseed(self, seed):
             self.random.seed(seed)
@@ -86,7 +86,7 @@ def test_values_with_births_and_deaths_match_stepping_by_hand(flatten):
 
 
 @METHODS
-def test_a_base_by_agent_sees_and_acts_as_the_agents_do(method):
+def test_action_values_in_turn_env_take_base_policies_by_agent(method):
     env = made()
 
     def by_kind(seen, info):
@@ -113,7 +113,7 @@ def paced(seen):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("view", ["turn", "aec", "parallel", "joint"])
-def test_base_for_all_agents_matches_bases_by_agent(view):
+def test_action_values_in_turn_env_take_one_base_policy_for_all_agents(view):
     bases = [
         dict.fromkeys(("left", "right"), paced),
         turn_policy(lambda seen: paced(seen["observation"]), like=made()),
@@ -133,7 +133,7 @@ def test_base_for_all_agents_matches_bases_by_agent(view):
 
 
 @pytest.mark.thorough
-def test_policies_that_plan_take_bases_for_all_agents():
+def test_rollout_and_tree_search_policy_take_a_base_for_all_agents():
     turn = turn_policy(lambda seen: paced(seen["observation"]), like=made())
     values = []
     for base in (dict.fromkeys(("left", "right"), paced), turn, turn | {"right": RULE}):
@@ -150,7 +150,7 @@ def test_policies_that_plan_take_bases_for_all_agents():
 
 
 @ONE_FUTURE
-def test_actions_of_bases_by_agent_are_translated_and_checked():
+def test_action_values_translate_and_check_actions_of_base_policies():
     ant = decision(agent="ant_0", action_space=spaces.Discrete(2, start=5))
     bee = decision(
         agent="bee_0",
@@ -176,7 +176,7 @@ def test_actions_of_bases_by_agent_are_translated_and_checked():
 
 
 @ONE_FUTURE
-def test_candidates_are_the_legal_actions_of_the_one_that_decides():
+def test_action_values_in_turn_env_try_the_deciding_agents_legal_actions():
     mask = np.array([1, 0, 1], np.int8)
     ant = decision(
         agent="ant_0", action_space=spaces.Discrete(3, start=4), action_mask_mapping=lambda: mask
@@ -200,7 +200,7 @@ def test_candidates_are_the_legal_actions_of_the_one_that_decides():
 
 
 @METHODS
-def test_planning_includes_wrappers_of_turn_views(method):
+def test_action_values_apply_wrappers_of_turn_env(method):
     env = made()
     seeds = futures_of(env, 2)
     table = [
@@ -221,7 +221,7 @@ def in_turn(actions):
 @pytest.mark.thorough
 @METHODS
 @ONE_FUTURE
-def test_trees_of_turn_views_find_the_best_sequence(method):
+def test_tree_search_policy_in_turn_env_finds_the_best_sequence(method):
     env = made(Unseeded)
     planner = TreeSearchPolicy([0, 2], depth=3, budget=60, horizon=4, margin=0, method=method)
     values = {}

@@ -29,7 +29,7 @@ def env_of(definition=FILL):
     return env
 
 
-def test_a_pending_decision_is_described_in_words():
+def test_describe_tells_a_pending_decision_in_words():
     env = aec_env(Tank, POINTS)
     env.reset(seed=1)
     env.step(2)
@@ -47,7 +47,7 @@ def test_a_pending_decision_is_described_in_words():
     ]
 
 
-def test_pending_decision_is_described_as_json():
+def test_describe_returns_a_pending_decision_as_json():
     found = describe(env_of(), as_json=True)
     assert json.loads(json.dumps(found)) == {
         "agent": "filler",
@@ -61,7 +61,7 @@ def test_pending_decision_is_described_as_json():
     }
 
 
-def test_question_and_display_take_the_place_of_rule_and_observation():
+def test_describe_uses_question_and_display_mapping_if_they_are_given():
     env = env_of(replace(FILL, question="How much?", display_mapping=lambda tank: {"m": "5 of 9"}))
     assert describe(env).splitlines()[1:4] == ["How much?", "Observation:", "- m: 5 of 9"]
     found = describe(env, as_json=True)
@@ -69,7 +69,7 @@ def test_question_and_display_take_the_place_of_rule_and_observation():
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
-def test_every_view_and_its_clones_are_described_alike(view):
+def test_describe_is_the_same_in_every_env_and_its_clones(view):
     env, words = view(Tank, {Tank.fill: FILL}), describe(env_of())
     for use in (describe, lambda env: parse(env, "open")):
         with pytest.raises(NotResetError):
@@ -84,7 +84,7 @@ def test_every_view_and_its_clones_are_described_alike(view):
         twin.close()
 
 
-def test_describe_of_a_decision_equals_that_of_its_environment():
+def test_describe_of_a_policys_decision_equals_that_of_its_env():
     said = []
 
     def policy(observation, *, _decision):
@@ -193,7 +193,7 @@ def test_parse_returns_one_legal_action_or_an_error_lists_them(labels, said):
         assert parse(env, said) == action
 
 
-def test_masked_actions_are_not_listed():
+def test_describe_omits_masked_actions():
     env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
     assert "half" not in describe(env)
     assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["closed", "open"]}
@@ -237,7 +237,7 @@ CHOICES = {
 
 
 @pytest.mark.parametrize("kind", CHOICES)
-def test_choices_are_labelled_exactly_and_each_in_another_way(kind):
+def test_describe_labels_each_choice_differently(kind):
     choices, labels = CHOICES[kind]
     env = env_of(
         replace(FILL, action_labels=None, action_space_mapping=None, choices=lambda tank: choices)
@@ -251,12 +251,12 @@ def test_choices_are_labelled_exactly_and_each_in_another_way(kind):
     (None, {0: "no", 1: [2], 2: "no"}, ["no (0)", "[2]", "no (2)"]),
     (lambda tank: {0: "1"}, str, ["1", "1 (1)", "2"]),
 ])  # fmt: skip
-def test_actions_without_a_label_have_their_decision_or_number(labels, decisions, enum):
+def test_describe_labels_actions_by_their_decision_or_number(labels, decisions, enum):
     env = env_of(replace(FILL, action_labels=labels, action_space_mapping=decisions))
     assert describe(env, as_json=True)["actions"]["enum"] == enum
 
 
-def test_action_labels_may_be_a_callable_of_the_call():
+def test_action_labels_can_be_a_function_of_the_arguments():
     env = env_of(
         replace(
             FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]
@@ -314,7 +314,7 @@ SPACES = {
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_actions_of_other_spaces_are_parsed_from_json(kind):
+def test_parse_reads_actions_of_other_spaces_from_json(kind):
     space, labels, texts, action = SPACES[kind]
     env = env_of(filling(space, action_labels=labels))
     for text in texts:
@@ -328,7 +328,7 @@ def test_actions_of_other_spaces_are_parsed_from_json(kind):
         assert (labels[name] if isinstance(labels, dict) else name) in describe(env)
 
 
-def test_the_schema_of_numbers_has_their_bounds_and_labels():
+def test_describe_json_schema_has_bounds_and_labels_of_numbers():
     def schema(space, **labels):
         return describe(env_of(filling(space, **labels)), as_json=True)["actions"]
 
@@ -363,7 +363,7 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
         schema(spaces.Box(0, 1, (2, 2)))
 
 
-def test_components_of_an_observation_are_described_by_their_labels():
+def test_describe_names_components_of_an_observation_by_labels():
     definition = replace(
         FILL,
         observation_space=spaces.Dict(
@@ -382,7 +382,7 @@ def test_components_of_an_observation_are_described_by_their_labels():
     ("f4", ["- a: 16777218", "- b: 0.1", "- c: 0.33333334", "- d: 2"]),
     ("f8", ["- a: 16777217.5", "- b: 0.1", "- c: 0.3333333333333333", "- d: 2"]),
 ])  # fmt: skip
-def test_descriptions_keep_all_significant_digits_of_numbers(dtype, lines):
+def test_describe_keeps_all_significant_digits_of_numbers(dtype, lines):
     definition = replace(
         FILL,
         observation_space=spaces.Box(-np.inf, np.inf, (4,), dtype),
@@ -392,7 +392,7 @@ def test_descriptions_keep_all_significant_digits_of_numbers(dtype, lines):
     assert describe(env_of(definition)).splitlines()[3:7] == lines
 
 
-def test_timelines_name_actions_by_their_labels():
+def test_plot_timeline_names_actions_by_their_labels():
     trajectories = collect_episodes(Tank, {"filler": RULE}, seeds=[1], points=POINTS)
     axes = plot_timeline(trajectories).axes
     assert "half" in {label.get_text() for one in axes for label in one.get_yticklabels()}
@@ -405,6 +405,6 @@ def test_timelines_name_actions_by_their_labels():
     {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
     {"observation_labels": ["a", "b"], "observation_space": spaces.Box(0, 1, (2, 2))},
 ])  # fmt: skip
-def test_labels_that_do_not_fit_their_space_are_refused(labels):
+def test_make_step_refuses_labels_that_do_not_fit_their_space(labels):
     with pytest.raises(SimEnvError, match=f"{next(iter(labels))} must be texts for the parts"):
         replace(FILL, **labels)

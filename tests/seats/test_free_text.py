@@ -35,7 +35,7 @@ def env():
     return env
 
 
-def test_any_text_up_to_its_length_is_in_the_space():
+def test_free_text_space_contains_any_text_up_to_its_length():
     space = free_text(40)
     assert all(text in space for text in ("", SAID, "x" * 40))
     assert all(text not in space for text in ("x" * 41, 3, None, b"x"))
@@ -78,12 +78,12 @@ def test_free_text_answer_is_parsed_as_text_or_as_its_action(env, text, action):
 
 
 @pytest.mark.parametrize("text", ["x" * 41, '{"action": 3}', "<think>no"])
-def test_other_answers_are_refused_with_the_longest_length(env, text):
+def test_free_text_refusal_of_an_answer_names_the_longest_length(env, text):
     with pytest.raises(InvalidActionError, match="any text of at most 40 characters"):
         parse(env, text)
 
 
-def test_recordings_and_files_repeat_texts(env, tmp_path):
+def test_free_text_actions_are_repeated_by_recordings_and_episode_files(env, tmp_path):
     logs = [
         played(RecordedPolicy(policy, tmp_path / "answers"), points=POINTS)
         for policy in (lambda observation: SAID, pytest.fail)
@@ -114,7 +114,7 @@ def test_episode_file_is_written_despite_lazily_loaded_modules(env, tmp_path):
     assert "loaded" in LAZY
 
 
-def test_free_text_may_be_an_observation():
+def test_free_text_can_be_an_observation():
     points = {
         Tank.fill: FILL,
         Tank.drain: replace(
@@ -135,6 +135,6 @@ def test_free_text_may_be_an_observation():
 
 
 @pytest.mark.thorough
-def test_check_finds_nothing_in_a_simulation_with_free_text():
+def test_check_simulation_accepts_a_simulation_with_free_text():
     report = check_simulation(partial(Tank), POINTS, episodes=2)
     assert "error" not in {finding.severity for finding in report.findings}

@@ -40,7 +40,7 @@ def model(address, **options):
     return LanguageModelPolicy("fake", base_url=address, api_key="a key", **options)
 
 
-def test_a_language_model_decides_by_labels():
+def test_language_policy_decides_by_action_labels():
     with endpoint([OPEN]) as (address, requests):
         policy = model(address, temperature=0.0)
         assert played(policy) == played(lambda observation: 2)
@@ -63,7 +63,7 @@ def test_a_language_model_decides_by_labels():
     }
 
 
-def test_numbers_are_checked_against_their_bounds_here_as_well():
+def test_language_policy_checks_numbers_against_the_space_bounds():
     points = {Tank.fill: filling(spaces.Box(0, 2, (1,)))}
     with endpoint([says('{"action": 7}'), says('{"action": 1.5}')]) as (address, requests):
         played(model(address), points=points)
@@ -74,7 +74,7 @@ def test_numbers_are_checked_against_their_bounds_here_as_well():
     assert "number from 0 to 2" in requests[1]["messages"][-1]["content"]
 
 
-def test_wrong_answer_is_corrected_in_the_conversation():
+def test_language_policy_corrects_a_wrong_answer_in_the_conversation():
     parts = [{"type": "text", "text": "Op"}, {"type": "thought"}, {"type": "text", "text": "en"}]
     with endpoint([says("ajar"), says(parts)]) as (address, requests):
         assert played(model(address))[0] == played(lambda observation: 2)[0]
@@ -89,7 +89,7 @@ def test_wrong_answer_is_corrected_in_the_conversation():
     fails(500), fails(503), fails(429, retry_after="0"), "<html>busy</html>",
     says(None, refusal="I would rather not"), says("  "), {"object": "something else"}, 2.0,
 ], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
-def test_temporary_failures_are_tried_again(answer):
+def test_language_policy_retries_temporary_failures(answer):
     with endpoint([answer, OPEN]) as (address, requests):
         assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
     assert len(requests) == 6
@@ -106,7 +106,7 @@ def test_temporary_failures_are_tried_again(answer):
     (says(""), "failed", LanguageModelError, "its content is empty"),
     (says("ajar"), "illegal", InvalidActionError, "'ajar' names no legal action"),
 ], ids=["500", "HTML", "refusal", "part", "filter", "cut off", "empty", "wrong"])  # fmt: skip
-def test_a_lasting_failure_is_an_error_and_a_fallback_answers(answer, kind, error, match):
+def test_language_policy_raises_lasting_failures_or_uses_the_fallback(answer, kind, error, match):
     with endpoint([answer]) as (address, requests):
         with pytest.raises(error, match=match):
             played(model(address, retries=1))
@@ -116,7 +116,7 @@ def test_a_lasting_failure_is_an_error_and_a_fallback_answers(answer, kind, erro
     assert len(requests) == 12
 
 
-def test_missing_api_key_is_an_error_and_a_refused_one_is_not_retried(monkeypatch):
+def test_language_policy_does_not_retry_a_refused_api_key(monkeypatch):
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     with pytest.raises(LanguageModelError, match="api_key"):
         played(LanguageModelPolicy("fake", base_url="http://127.0.0.1:9/v1"))
@@ -131,7 +131,7 @@ def test_missing_api_key_is_an_error_and_a_refused_one_is_not_retried(monkeypatc
     (400, "response_format is not supported"), (422, "extra inputs are not permitted"),
     (404, "no endpoint can do structured outputs"), (500, "unknown response_format"),
 ])  # fmt: skip
-def test_an_endpoint_without_structured_output_is_asked_without(status, problem):
+def test_language_policy_works_without_structured_output(status, problem):
     with endpoint([fails(status, problem), OPEN]) as (address, requests):
         assert played(model(address, retries=0)) == played(lambda observation: 2)
     assert ["response_format" in request for request in requests] == [True] + [False] * 5
@@ -139,7 +139,7 @@ def test_an_endpoint_without_structured_output_is_asked_without(status, problem)
 
 
 @pytest.mark.parametrize(("answer", "kind"), [(fails(404, "no such model"), "http"), (0.5, "late")])
-def test_another_error_leaves_structured_output_as_it_is(answer, kind):
+def test_language_policy_keeps_structured_output_after_other_errors(answer, kind):
     with endpoint([answer]) as (address, _):
         policy = FallbackPolicy(model(address, timeout=0.1, retries=0))
         assert played(policy) == played(RULE)
@@ -149,7 +149,7 @@ def test_another_error_leaves_structured_output_as_it_is(answer, kind):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("wrap", [lambda make: None, lambda make: make(), lambda make: make])
-def test_each_process_has_its_own_connection(wrap):
+def test_language_policy_opens_a_connection_per_process(wrap):
     async def closing(observation):
         await policy._client_here().close()
         return 2
@@ -167,13 +167,13 @@ def test_each_process_has_its_own_connection(wrap):
     assert sorted(ports.values()) == [5, 15]
 
 
-def test_a_client_that_cannot_be_copied_is_refused_elsewhere():
+def test_language_policy_refuses_an_uncopyable_client_in_another_process():
     policy = LanguageModelPolicy("own", client=SimpleNamespace(chat=Lock()))
     with pytest.raises(LanguageModelError, match="client= be a function that makes it"):
         played(copy.copy(policy))
 
 
-def test_requests_contain_the_latest_decisions_of_the_agent():
+def test_language_policy_requests_contain_the_agents_latest_decisions():
     with endpoint([says("open"), says("half"), says("closed")]) as (address, requests):
         played(model(address, history=2))
     roles = [[message["role"][0] for message in request["messages"]] for request in requests[:4]]
@@ -183,7 +183,7 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
     assert answers == ["half", "closed"]
 
 
-def test_episodes_of_one_seed_have_a_history_each():
+def test_language_policy_keeps_a_history_per_episode():
     with endpoint([OPEN]) as (address, requests):
         levels(model(address, history=9), seeds=[7, 7])
     assert sorted(len(request["messages"]) for request in requests) == [
@@ -200,7 +200,7 @@ def test_episodes_of_one_seed_have_a_history_each():
     ]
 
 
-def test_a_policy_that_is_sent_to_another_process_decides_there():
+def test_language_policy_sent_to_another_process_decides_there():
     with endpoint([OPEN]) as (address, _):
         policy = model(address)
         assert played(policy) == played(pickle.loads(pickle.dumps(policy)))
@@ -226,7 +226,7 @@ def test_language_policy_takes_a_custom_client_and_instructions():
     assert {len(request["messages"]) for request in asked} == {2}  # no decisions before
 
 
-def test_the_prompt_of_a_pending_decision_is_shown():
+def test_language_policy_shows_the_prompt_of_a_pending_decision():
     env = single_env(Tank, {Tank.fill: FILL})
     env.reset(seed=1)
     found = LanguageModelPolicy("fake", instructions="Be quick.").prompt(env)
@@ -242,6 +242,6 @@ def test_language_policy_without_openai_names_the_missing_extra(monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [{"history": -1}, {"retries": 1.5}, {"describe": "words"}])
-def test_arguments_that_cannot_be_used_are_refused(arguments):
+def test_language_policy_refuses_invalid_arguments(arguments):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):
         LanguageModelPolicy("fake", **arguments)

@@ -35,7 +35,7 @@ def shown(**parts):
     return seen
 
 
-def test_a_question_is_a_text_or_depends_on_the_call():
+def test_question_of_make_step_is_a_text_or_a_function_of_the_arguments():
     assert {question for question, _ in shown(question="How much?")} == {"How much?"}
     asked = shown(question=lambda tank, *, _simulation: f"Day {_simulation.day}?")
     assert [question for question, _ in asked] == [f"Day {day}?" for day in range(5)]
@@ -50,7 +50,7 @@ def test_a_question_is_a_text_or_depends_on_the_call():
         ("\n    Fill it\n    again? Yes.", "By its rule: Fill it again?"),
     ],
 )
-def test_a_question_defaults_to_the_first_sentence_of_the_rule(monkeypatch, doc, question):
+def test_question_defaults_to_the_first_sentence_of_the_docstring(monkeypatch, doc, question):
     monkeypatch.setattr(Tank.fill, "__doc__", doc)
     assert decisions(POINTS)[0].question == question
 
@@ -82,7 +82,7 @@ def test_display_mapping_is_called_with_the_arguments_of_the_call():
     assert shown()[0][1] is None
 
 
-def test_items_of_a_split_call_have_questions():
+def test_question_can_be_given_for_split_items():
     class Ward:
         def reset(self, seed=None):
             self.log = []
@@ -121,7 +121,7 @@ def test_items_of_a_split_call_have_questions():
         ("display_mapping", lambda tank: {0: tank.level}),
     ],
 )
-def test_questions_and_displays_that_are_no_texts_are_refused(part, value):
+def test_question_and_display_mapping_that_return_no_text_are_refused(part, value):
     with pytest.raises(DefinitionError, match=f"{part} of .*fill has returned"):
         shown(**{part: value})
     report = check_simulation(Tank, {Tank.fill: replace(FILL, **{part: value})})
@@ -129,12 +129,12 @@ def test_questions_and_displays_that_are_no_texts_are_refused(part, value):
 
 
 @pytest.mark.parametrize("parts", [{"question": ""}, {"question": 3}, {"display_mapping": {}}])
-def test_definitions_refuse_other_questions_and_displays(parts):
+def test_make_step_refuses_invalid_question_and_display_mapping(parts):
     with pytest.raises(DefinitionError, match=f"{next(iter(parts))} must be"):
         replace(FILL, **parts)
 
 
-def test_a_display_may_take_an_argument_that_no_other_mapping_takes():
+def test_display_mapping_can_take_an_argument_that_no_other_mapping_takes():
     class Shop(Tank):
         def run(self):
             self.log.append(self.order("nails", 3))

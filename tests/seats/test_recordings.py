@@ -53,7 +53,7 @@ def raises(observation):
 
 
 @pytest.mark.parametrize("kind", [Asked, Waiting])
-def test_recording_repeats_its_seeds_without_calling_the_policy(kind, path):
+def test_recorded_policy_repeats_its_seeds_without_calling_the_policy(kind, path):
     first = kind()
     recorded = levels(RecordedPolicy(first, path), range(4))
     assert first.times == len(lines_of(path)) == 20
@@ -66,7 +66,7 @@ def test_recording_repeats_its_seeds_without_calling_the_policy(kind, path):
     assert second.times == 5  # those of the new seed
 
 
-def test_torn_last_line_of_a_recording_loses_only_that_answer(path):
+def test_recorded_policy_loses_only_the_torn_last_line_of_its_file(path):
     def asked_again():
         policy = Asked()
         assert played(RecordedPolicy(policy, path)) == played(Asked())
@@ -123,7 +123,7 @@ def nested(outer, policy, path, **options):
 @pytest.mark.thorough
 @pytest.mark.parametrize("policy", [unreliable, slow])
 @pytest.mark.parametrize("outer", [FallbackPolicy, RecordedPolicy])
-def test_fallback_and_recording_repeat_a_run_in_either_nesting(policy, outer, path):
+def test_fallback_and_recorded_policy_repeat_a_run_in_either_nesting(policy, outer, path):
     def run(outer, policy):
         decided, guarded = nested(outer, policy, path, retries=1)
         found = evaluate(Tank, {"guarded": {"filler": decided}}, seeds=range(3), points=POINTS)
@@ -141,7 +141,7 @@ def test_fallback_and_recording_repeat_a_run_in_either_nesting(policy, outer, pa
     assert all(line["why"] for line in by_fallback)
 
 
-def test_recording_repeats_extras_of_a_policy(path):
+def test_recorded_policy_repeats_extras_of_a_policy(path):
     def sure(observation):
         return 1, {"confidence": np.float32(observation[0]), "votes": np.array([1, 2])}
 
@@ -155,7 +155,7 @@ def test_recording_repeats_extras_of_a_policy(path):
     np.testing.assert_equal(extras(raises), first)
 
 
-def test_illegal_answers_without_a_fallback_are_not_recorded(path):
+def test_recorded_policy_does_not_record_illegal_actions(path):
     with pytest.raises(ValueError, match="not in its action space"):
         played(RecordedPolicy(lambda observation: 9, path))
     assert not path.exists()
@@ -164,7 +164,7 @@ def test_illegal_answers_without_a_fallback_are_not_recorded(path):
 # -- which answer belongs to which decision -------------------------------------------------------
 
 
-def test_an_episode_with_other_observations_is_refused(path):
+def test_recorded_policy_refuses_an_episode_with_other_observations(path):
     class Fuller(Tank):
         def reset(self, seed=None):
             super().reset(seed)
@@ -180,7 +180,7 @@ def test_an_episode_with_other_observations_is_refused(path):
     assert len(lines_of(path)) == 15
 
 
-def test_an_episode_with_other_legal_actions_is_refused(path):
+def test_recorded_policy_refuses_an_episode_with_other_legal_actions(path):
     played(RecordedPolicy(Asked(), path))
     for part in (
         {"action_mask_mapping": lambda tank: [1, 1, tank.level < 5.1]},
@@ -190,7 +190,7 @@ def test_an_episode_with_other_legal_actions_is_refused(path):
             played(RecordedPolicy(Asked(), path), points={Tank.fill: replace(FILL, **part)})
 
 
-def test_recording_is_continued_if_the_episode_is_longer(path, monkeypatch):
+def test_recorded_policy_continues_its_file_if_the_episode_is_longer(path, monkeypatch):
     played(RecordedPolicy(Asked(), path))
     monkeypatch.setattr(Tank, "days", 8)
     policy = Asked()
@@ -198,7 +198,7 @@ def test_recording_is_continued_if_the_episode_is_longer(path, monkeypatch):
     assert policy.times == 3
 
 
-def test_answers_of_another_model_or_prompt_are_refused(path):
+def test_recorded_policy_refuses_answers_of_another_language_model(path):
     def policy(model="small", **options):
         async def create(*, messages, **request):
             message = SimpleNamespace(content='{"action": "open"}')
@@ -234,7 +234,7 @@ class Shuffled(Tank):
         self.log = sorted(answers.items())
 
 
-def test_answers_are_found_in_any_order_of_decisions(path, monkeypatch):
+def test_recorded_policy_finds_answers_in_any_order_of_decisions(path, monkeypatch):
     points = {
         Shuffled.fill: replace(
             FILL, observation_space_mapping=lambda tank: [tank.day * 2 + tank.level]
@@ -247,7 +247,7 @@ def test_answers_are_found_in_any_order_of_decisions(path, monkeypatch):
     assert (again, policy.times) == (first, 6)
 
 
-def test_equal_decisions_get_their_answers_in_turn(path):
+def test_recorded_policy_answers_equal_decisions_in_their_order(path):
     points = {Tank.fill: replace(FILL, observation_space_mapping=lambda tank: [0])}
 
     def counting(observation, *, _decision):
@@ -257,7 +257,7 @@ def test_equal_decisions_get_their_answers_in_turn(path):
     assert played(RecordedPolicy(raises, path), points=points) == first
 
 
-def test_recordings_of_older_versions_are_read(path):
+def test_recorded_policy_reads_files_of_older_versions(path):
     seen = []
 
     def taken(action):
@@ -285,7 +285,7 @@ UNTYPED = {
 
 
 @pytest.mark.parametrize("kind", UNTYPED)
-def test_actions_of_recordings_without_types_are_read(kind, tmp_path):
+def test_recorded_policy_reads_actions_without_types(kind, tmp_path):
     space, written, action = UNTYPED[kind]
     seen, path = [], tmp_path / "answers"
     points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
@@ -316,7 +316,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("kind", PARTS)
-def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
+def test_recorded_policy_repeats_actions_of_any_space_exactly(kind, tmp_path):
     space, action = PARTS[kind]
     seen = []
     points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}

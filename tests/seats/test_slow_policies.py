@@ -75,7 +75,7 @@ def compared(policy):
         (in_a_notebook, batched),
     ],
 )
-def test_a_coroutine_function_answers_as_a_function_does(run, plain):
+def test_coroutine_policy_decides_like_a_plain_policy(run, plain):
     assert run(slow) == run(plain)
 
 
@@ -84,14 +84,14 @@ def test_a_coroutine_function_answers_as_a_function_does(run, plain):
     lambda policy: policy, FallbackPolicy, lambda policy: RecordedPolicy(policy, os.devnull),
     partial(FallbackPolicy, batched),  # which fails
 ])  # fmt: skip
-def test_policies_may_return_extras_in_every_runner(run, wrap):
+def test_policies_can_return_extras_in_simulate_and_collect_episodes(run, wrap):
     async def later(observation):
         return await slow(observation), {"odds": 0.5}
 
     assert run(wrap(later)) == run(slow)
 
 
-def test_tuple_action_is_not_mistaken_for_an_action_with_extras():
+def test_policy_returning_a_tuple_action_is_not_mistaken_for_extras():
     pair = spaces.Tuple([spaces.Discrete(3), spaces.Dict({"odds": spaces.Discrete(2)})])
     seen = []
     points = {Tank.fill: filling(pair, lambda action: seen.append(action) or 1.0)}
@@ -106,7 +106,7 @@ def test_tuple_action_is_not_mistaken_for_an_action_with_extras():
         Tank, {"it": {"filler": policy}}, seeds=range(6), points=POINTS, concurrency=4
     ),
 ])  # fmt: skip
-def test_concurrency_limits_how_many_decisions_wait_at_once(run):
+def test_concurrency_option_limits_how_many_coroutine_policies_run(run):
     waiting, most = 0, 0
 
     async def counted(observation):
@@ -121,7 +121,7 @@ def test_concurrency_limits_how_many_decisions_wait_at_once(run):
     assert most == 4
 
 
-def test_quick_policies_are_asked_in_batches_beside_slow_ones():
+def test_batched_policies_are_asked_in_batches_beside_coroutine_policies():
     sizes = []
 
     def downwards(observations):
@@ -137,7 +137,7 @@ def test_quick_policies_are_asked_in_batches_beside_slow_ones():
     assert sum(sizes) == 6 * Tank.days
 
 
-def test_slow_policies_give_the_results_of_quick_policies(tmp_path):
+def test_coroutine_policies_give_the_same_results_as_plain_policies(tmp_path):
     contenders, seeds = {"slow": {"filler": slow}, "quick": {"filler": quick}}, range(6)
     values = evaluate(Tank, contenders, seeds=seeds, points=POINTS, concurrency=5).values()
     assert (values["slow"] == values["quick"]).all()
@@ -147,7 +147,7 @@ def test_slow_policies_give_the_results_of_quick_policies(tmp_path):
     assert (team["quick"] == values["slow"]).all()
 
 
-def test_a_row_that_fails_does_not_stop_the_others_that_wait(tmp_path):
+def test_coroutine_policy_that_fails_does_not_stop_other_decisions(tmp_path):
     async def sometimes(observation, *, _decision):
         await asyncio.sleep(0.001)
         if _decision.seed == 2:
@@ -165,7 +165,7 @@ def test_a_row_that_fails_does_not_stop_the_others_that_wait(tmp_path):
     lambda policy: levels(policy, concurrency=2),
     lambda policy: evaluate(Tank, {"it": {"filler": policy}}, seeds=range(4), points=POINTS),
 ])  # fmt: skip
-def test_an_error_of_a_coroutine_surfaces_and_nothing_is_left(run):
+def test_coroutine_policy_error_is_raised_and_leaves_no_tasks(run):
     ended = []
 
     async def failing(observation, info, *, _decision):
@@ -184,7 +184,7 @@ def test_an_error_of_a_coroutine_surfaces_and_nothing_is_left(run):
     assert stacks() <= before
 
 
-def test_an_exit_in_a_coroutine_surfaces_and_later_coroutines_are_answered():
+def test_coroutine_policy_system_exit_is_raised():
     async def leaves(observation):
         raise SystemExit(3)
 
@@ -193,7 +193,7 @@ def test_an_exit_in_a_coroutine_surfaces_and_later_coroutines_are_answered():
     assert levels(slow) == levels(batched)
 
 
-def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
+def test_keyboard_interrupt_cancels_coroutine_policies_and_simulations():
     cancelled = []
 
     async def endless(observation, *, _decision):
@@ -219,7 +219,7 @@ def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
     assert sorted(cancelled) == [0, 1, 2, 3]
 
 
-def test_coroutine_policies_run_on_one_event_loop_in_all_calls():
+def test_coroutine_policies_run_on_one_event_loop_in_all_simulations():
     loops = set()
 
     async def noting(observation):
@@ -232,7 +232,7 @@ def test_coroutine_policies_run_on_one_event_loop_in_all_calls():
 
 
 @pytest.mark.parametrize("policy", [slow, RolloutPolicy(), FallbackPolicy(quick)])
-def test_a_mixture_refuses_policies_that_are_asked_alone(policy):
+def test_mixture_refuses_coroutine_policies(policy):
     with pytest.raises(OptionValueError, match="one decision at a time"):
         Mixture({policy: 1.0})
 
@@ -259,19 +259,19 @@ async def illegal(observation):
         (illegal, InvalidActionError, "action 9"),
     ],
 )
-def test_policies_that_cannot_be_awaited_raise_error_with_a_remedy(policy, error, match):
+def test_coroutine_policy_in_an_env_raises_an_error_with_a_remedy(policy, error, match):
     with pytest.raises(error, match=match):
         played(policy)
 
 
-def test_a_coroutine_may_wait_for_others_in_a_thread():
+def test_coroutine_policy_can_wait_for_work_in_a_thread():
     async def threaded(observation):
         return len(await asyncio.to_thread(played, slow)) - 3
 
     assert played(threaded) == played(lambda observation: 2)
 
 
-def test_partial_coroutine_functions_and_objects_are_awaited():
+def test_partial_coroutine_functions_and_objects_work_as_policies():
     class Asked:
         async def __call__(self, more, observation):
             return 2
@@ -284,7 +284,7 @@ def test_partial_coroutine_functions_and_objects_are_awaited():
 
 @pytest.mark.parametrize("waits", [False, True])
 @pytest.mark.parametrize("many", [False, True])
-def test_a_policy_gets_the_pending_decision(waits, many):
+def test_policy_with_decision_parameter_gets_the_pending_decision(waits, many):
     seen = []
 
     def plain(observation, *, _decision):
@@ -315,7 +315,7 @@ def test_a_policy_gets_the_pending_decision(waits, many):
     assert not first.in_clone
 
 
-def test_changes_of_a_policy_to_its_decision_affect_nothing_else():
+def test_policy_that_changes_its_decision_object_affects_nothing_else():
     def spoil(observation, *, _decision):
         assert _decision.observation_labels == {"level": "Level"}
         before = float(observation["level"][0])
@@ -338,7 +338,7 @@ def test_changes_of_a_policy_to_its_decision_affect_nothing_else():
         played(spoil, points={Tank.fill: replace(FILL, **given)})
 
 
-def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
+def test_pending_decision_adds_up_rewards_of_skipped_decisions():
     rewards = []
 
     def plain(observation, *, _decision):
@@ -362,7 +362,7 @@ def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
 
 
 @pytest.mark.thorough
-def test_bases_that_are_coroutines_are_replaced_by_the_rule():
+def test_planning_with_a_coroutine_base_uses_the_models_rule():
     async def never(observation):
         raise AssertionError("it is asked in a branch")
 

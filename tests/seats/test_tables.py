@@ -96,7 +96,7 @@ def runs(tmp_path_factory):
     return tables, requests, [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_recorded_table_is_repeated_exactly_without_requests(runs):
+def test_language_policy_table_in_the_docs_is_repeated_from_recordings(runs):
     (first, second), requests, lines = runs
     assert requests[0] >= len(lines) == 4 * 20
     assert requests[1] == requests[0]
@@ -107,7 +107,7 @@ def test_recorded_table_is_repeated_exactly_without_requests(runs):
 
 
 @pytest.mark.thorough
-def test_wrong_answer_of_the_model_is_parsed_or_the_rule_decides(runs):
+def test_language_policy_wrong_answer_is_parsed_or_the_rule_decides(runs):
     _, _, lines = runs
     for line in lines:
         lie = lie_at(line["number"])
@@ -116,7 +116,7 @@ def test_wrong_answer_of_the_model_is_parsed_or_the_rule_decides(runs):
         assert ("why" in line) == (lie in KINDS)
 
 
-def test_table_of_results_equals_the_one_in_the_docs(runs):
+def test_language_policy_table_equals_the_one_in_the_docs(runs):
     (found, _), _, lines = runs
     seat = found.seats.set_index("contender").loc["language model"]
     kinds = Counter(KINDS[lie] for line in lines if (lie := lie_at(line["number"])) in KINDS)

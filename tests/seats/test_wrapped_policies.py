@@ -86,7 +86,7 @@ def two(observation):
     (stubborn, "late"), (cancelled, "failed"), (cancelled_at_once, "failed"), (busy, "http"),
     (illegal, "illegal"), (illegal_later, "illegal"),
 ])  # fmt: skip
-def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
+def test_fallback_policy_answers_after_the_retries_and_counts_it(policy, kind, retries):
     timeout = 0.002 if kind == "late" else None  # others may be late, too, on a busy machine
     guarded = FallbackPolicy(policy, one, timeout=timeout, retries=retries)
     assert played(guarded) == played(one)
@@ -95,13 +95,13 @@ def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, ret
     assert guarded.last_error is not None
 
 
-def test_an_exit_of_a_coroutine_ends_the_simulation_and_not_the_event_loop():
+def test_fallback_policy_raises_system_exit_of_a_coroutine():
     with pytest.raises(SystemExit):
         played(FallbackPolicy(exits))
     assert played(FallbackPolicy(illegal_later)) == played(RULE)
 
 
-def test_an_answer_after_a_retry_is_used():
+def test_fallback_policy_uses_an_answer_after_a_retry():
     tries = []
 
     def second(observation):
@@ -146,7 +146,7 @@ def test_fallback_policy_takes_every_kind_of_policy_and_rule(arguments, plain, f
     assert (guarded.last_error is None) == (not faults)
 
 
-def test_an_illegal_answer_of_the_fallback_is_an_error():
+def test_fallback_policy_raises_an_error_for_its_fallbacks_illegal_action():
     with pytest.raises(InvalidActionError, match="action 9"):
         played(FallbackPolicy(raises, illegal))
 
@@ -155,7 +155,7 @@ def test_an_illegal_answer_of_the_fallback_is_an_error():
     {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"},
     {"retries": -1}, {"retries": True},
 ])  # fmt: skip
-def test_invalid_arguments_are_refused_at_construction(arguments, tmp_path):
+def test_fallback_policy_refuses_invalid_arguments(arguments, tmp_path):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):
         FallbackPolicy(**{"policy": raises, **arguments})
     with pytest.raises(DefinitionError, match="keyword-only"):
@@ -175,7 +175,7 @@ async def sometimes(observation, *, _decision):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("workers", [0, 2])
-def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
+def test_fallback_policy_counts_are_kept_per_agent_and_seed(workers, tmp_path):
     guarded, seeds = FallbackPolicy(sometimes), range(4)
     contenders = {"guarded": {"filler": guarded}, "plain": {"filler": one}}
     found = evaluate(Tank, contenders, seeds=seeds, points=POINTS, workers=workers)
@@ -191,7 +191,7 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
     assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
-def test_fallbacks_are_a_share_of_the_decisions_of_their_policy():
+def test_fallback_policy_share_counts_only_decisions_of_the_wrapped_policy():
     async def counting(observation, *, _decision):
         _decision.count(tokens=3, words=1)
         return await sometimes(observation, _decision=_decision)
@@ -212,7 +212,7 @@ def test_fallbacks_are_a_share_of_the_decisions_of_their_policy():
     }  # fmt: skip
 
 
-def test_summary_marks_contenders_with_many_fallbacks():
+def test_evaluate_summary_marks_contenders_with_many_fallbacks():
     contenders = {
         "bad": {"filler": FallbackPolicy(raises)},
         "good": {"filler": FallbackPolicy(one)},
@@ -250,7 +250,7 @@ def then_the_rule(observation, *, _decision):
         (FallbackPolicy(illegal_later, two), two),
     ],
 )
-def test_clones_and_branches_use_fallbacks_and_count_nothing(policy, plain, method):
+def test_fallback_policy_does_not_count_in_clones_and_branches(policy, plain, method):
     def begun(policy):
         env = single_env(Tank, POINTS, agent="drainer", policies={"filler": policy})
         env.reset(seed=1)
@@ -268,7 +268,7 @@ def test_clones_and_branches_use_fallbacks_and_count_nothing(policy, plain, meth
     assert rest(env) == rest(begun(two))
 
 
-def test_copies_and_pickles_count_together():
+def test_fallback_policy_copies_and_pickles_share_their_counts():
     guarded = FallbackPolicy(raises)
     played(copy.deepcopy(guarded))
     played(pickle.loads(pickle.dumps(guarded)))

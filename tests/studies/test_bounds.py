@@ -47,7 +47,7 @@ def test_bounds_study_plans_inventories(tmp_path, capsys):
     check_bounds([["plan"], *table], tmp_path, capsys.readouterr().out, ["bounds-inventory.png"])
 
 
-def test_bounds_study_has_the_rule_of_the_inventory_benchmark():
+def test_bounds_study_rule_equals_that_of_the_inventory_benchmark():
     pytest.importorskip("gym_invmgmt")
     from studies.bounds.warehouse import Warehouse
 

@@ -42,7 +42,7 @@ def short(kind):
     return Short
 
 
-def test_greenhouse_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
+def test_greenhouse_study_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
     train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)])
     named = re.findall(
         r"^  (\S+/\S+)", capsys.readouterr().out.partition("What to do next:")[2], re.MULTILINE
@@ -58,7 +58,7 @@ def test_greenhouse_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
         assert big(tmp_path / f"{name}.png")
 
 
-def test_greenhouse_matrix_writes_tables_and_pictures(tmp_path, capsys, monkeypatch):
+def test_greenhouse_matrix_study_writes_tables_and_pictures(tmp_path, capsys, monkeypatch):
     pytest.importorskip("seaborn")
     pytest.importorskip("statsmodels")
     monkeypatch.setattr(variants, "House", short(variants.House))
@@ -76,7 +76,7 @@ def test_greenhouse_matrix_writes_tables_and_pictures(tmp_path, capsys, monkeypa
         assert (tmp_path / f"matrix-{name}.md").read_text() in shown
 
 
-def test_greenhouse_plans_draws_budgets_and_horizons(tmp_path, monkeypatch):
+def test_greenhouse_planning_study_draws_budgets_and_horizons(tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "GreenhouseSim", short(GreenhouseSim))
     plans.main(["--seeds", "1", "--horizons", "1", "--futures", "1", "--figures", str(tmp_path)])
     assert big(tmp_path / "plan-budget.png")
@@ -87,7 +87,7 @@ def test_greenhouse_plans_draws_budgets_and_horizons(tmp_path, monkeypatch):
     ]
 
 
-def test_credit_compares_estimators_with_the_truth(capsys):
+def test_credit_assignment_study_compares_estimators_with_the_truth(capsys):
     pytest.importorskip("mesa")
     from studies.credit import estimators
 
@@ -100,7 +100,7 @@ def test_credit_compares_estimators_with_the_truth(capsys):
     assert all(way.title in shown for way in (returns, apart, paired, *others))
 
 
-def test_bases_study_compares_substitutes_for_other_planners(monkeypatch, capsys):
+def test_base_policies_study_compares_substitutes_for_planning_agents(monkeypatch, capsys):
     monkeypatch.setattr("studies.bases.model.END", 15.0)
     monkeypatch.setattr("examples.greenhouse_coop.env.DAYS", 12)
     table = bases.main(["--quick"])
@@ -109,7 +109,7 @@ def test_bases_study_compares_substitutes_for_other_planners(monkeypatch, capsys
     assert all(" ".join(row[:2]) in shown.replace(" | ", " ") for row in table)
 
 
-def test_event_planning_compares_planners_with_the_rule(monkeypatch):
+def test_event_planning_study_compares_planning_with_the_models_rule(monkeypatch):
     monkeypatch.setattr(event_models, "JOBS", 3)
     rows = events.main(["--quick", "--horizon", "2"])
     settings = [(name, unit) for name in events.MODELS for unit in ("decision", "time")]
@@ -117,7 +117,7 @@ def test_event_planning_compares_planners_with_the_rule(monkeypatch):
     assert all(0 <= row.share <= 1 and row.error >= 0 for row in rows)
 
 
-def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
+def test_wolf_sheep_planning_study_lets_one_sheep_plan(capsys):
     pytest.importorskip("mesa")
     from studies.wolf_sheep import plan as sheep
 
@@ -128,7 +128,7 @@ def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
     assert "plans longer than by the rule" in capsys.readouterr().out
 
 
-def test_pension_writes_tables_and_pictures(tmp_path, capsys):
+def test_pension_study_writes_tables_and_pictures(tmp_path, capsys):
     pytest.importorskip("seaborn")
     pension.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
     shown = capsys.readouterr().out
@@ -138,12 +138,12 @@ def test_pension_writes_tables_and_pictures(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("points", [CASES, NAMED_COLLECTOR])
-def test_the_check_of_the_library_finds_nothing_in_debt_collection(points):
+def test_check_simulation_finds_nothing_in_the_debt_collection_study(points):
     report = check_simulation(partial(CollectionSim, 30), points, episodes=2)
     assert not [finding for finding in report.findings if finding.severity != "note"], report
 
 
-def test_debt_collection_learns_and_compares(capsys):
+def test_debt_collection_study_learns_and_compares(capsys):
     agency.main(["--days", "60"])
     assert "profit, dollars" in capsys.readouterr().out
     debts.main(["--generations", "1", "--seeds", "2", "--days", "60"])
@@ -157,7 +157,7 @@ def test_debt_collection_learns_and_compares(capsys):
     assert result["difference"] > result["difference_low"] > 0
 
 
-def test_pages_state_the_figures_of_the_finals():
+def test_docs_pages_state_the_figures_of_the_finished_studies():
     """The table of the greenhouse experiment agrees with the runs under version control."""
     pytest.importorskip("pandas")
     import pandas as pd
@@ -167,7 +167,7 @@ def test_pages_state_the_figures_of_the_finals():
     assert results.table(finals) == (results.FIGURES / "experiment.md").read_text()
 
 
-def test_queue_network_compares_two_learners_with_their_rules(capsys):
+def test_queue_network_study_compares_two_learners_with_their_rules(capsys):
     network.main(["--episodes", "150", "--trainings", "1", "--runs", "20"])
     shown = capsys.readouterr().out
     assert shown.count("both learned") == 3

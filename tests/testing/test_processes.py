@@ -21,7 +21,7 @@ def checked(simulation, **changes):
 
 
 @pytest.mark.thorough
-def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
+def test_check_simulation_reports_runs_that_depend_on_string_hashes():
     for model in (UnorderedWalk, NotedWalk, HashedWalk):
         (seen,) = checked(model).of("error")
         assert seen.title.endswith("not give the same run in another process")
@@ -30,13 +30,13 @@ def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
 
 
 @pytest.mark.thorough
-def test_check_accepts_sorted_sets():
+def test_check_simulation_accepts_sorted_sets():
     report = checked(OrderedWalk)
     assert not report.of("error")
     assert any("six hash seeds" in line for line in report.checked)
 
 
-def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
+def test_check_simulation_tells_why_it_skips_an_unpicklable_model():
     lock = threading.Lock()
     report = checked(NamedWalk, reward_mapping=lambda walk: walk.place + lock.locked())
     assert report.ok
@@ -45,7 +45,7 @@ def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
     )
 
 
-def test_a_script_without_a_main_guard_can_be_checked(tmp_path):
+def test_check_simulation_works_in_a_script_without_a_main_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "from tests.testing.test_processes import checked\n"

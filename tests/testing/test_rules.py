@@ -93,11 +93,11 @@ class Lazy(Walk):
         return self.random.choice([-1, 0, 1])
 
 
-def test_rule_that_draws_and_caches_passes_the_check():
+def test_check_simulation_accepts_a_rule_that_draws_and_caches():
     sound(Lazy)
 
 
-def test_apply_may_change_the_attributes_that_its_rule_changes():
+def test_check_simulation_lets_apply_change_what_its_rule_changes():
     class Applied(Serves):
         pass
 
@@ -108,7 +108,7 @@ def test_apply_may_change_the_attributes_that_its_rule_changes():
     sound(Applied, {"action_space_mapping": None, "apply": take})
 
 
-def test_fingerprint_leaves_out_attributes_that_a_rule_may_change():
+def test_check_simulation_ignores_attributes_that_a_rule_may_change():
     sound(Counts, fingerprint=lambda walk: walk.place)
 
 
@@ -139,7 +139,7 @@ class Clocked(Walk):
         return self.clock.now
 
 
-def test_check_accepts_generator_points_that_do_not_wait():
+def test_check_simulation_accepts_generator_points_that_do_not_wait():
     sound(Clocked)
 
 
@@ -153,7 +153,7 @@ class Hesitates(Clocked):
         return 1
 
 
-def test_check_accepts_apply_that_waits_like_its_rule():
+def test_check_simulation_accepts_apply_that_waits_like_its_rule():
     class Applied(Hesitates):
         pass
 
@@ -164,7 +164,7 @@ def test_check_accepts_apply_that_waits_like_its_rule():
     sound(Applied, {"action_space_mapping": None, "apply": apply})
 
 
-def test_check_finds_apply_that_does_not_wait_like_its_rule():
+def test_check_simulation_finds_apply_that_does_not_wait_like_its_rule():
     class Applied(Hesitates):
         pass
 
@@ -259,7 +259,7 @@ def herd(*kinds):
     return {kind.move: definition for kind in kinds}
 
 
-def test_an_override_that_is_no_decision_point_is_an_error():
+def test_check_simulation_reports_an_override_that_is_no_decision_point():
     report = check_simulation(Herd, herd(Animal), episodes=2)
     seen = finding(report, "override a decision point")
     assert seen.severity == "error"
@@ -267,7 +267,7 @@ def test_an_override_that_is_no_decision_point_is_an_error():
     assert "add it to points" in " ".join(seen.explanation.split())
 
 
-def test_check_accepts_overrides_that_are_points_or_call_super():
+def test_check_simulation_accepts_overrides_that_decide_or_call_super():
     clean(check_simulation(Herd, herd(Animal, Sheep), episodes=2))
     clean(check_simulation(SoundHerd, herd(Animal), episodes=2))
 
@@ -352,7 +352,7 @@ class Busy(Walk):
         return len(self.log) // 50
 
 
-def test_check_accepts_many_decisions_at_one_time():
+def test_check_simulation_accepts_many_decisions_at_one_time():
     report = checked(Busy)
     assert report.ok, report
 
@@ -377,7 +377,7 @@ class Slow(Walk):
         return 1
 
 
-def test_check_ends_at_its_time_limit_and_lists_skipped_checks():
+def test_check_simulation_lists_checks_skipped_at_its_time_limit():
     begin = time.monotonic()
     report = checked(Slow, time_limit=2)
     assert time.monotonic() - begin < 5
@@ -405,12 +405,12 @@ fault_of("OneLabel", "error", "callable of labels",
          observation_labels=lambda walk: ["place"])  # fmt: skip
 
 
-def test_check_accepts_a_space_of_one_observation():
+def test_check_simulation_accepts_a_space_of_one_observation():
     nothing = {"observation_space": spaces.Discrete(1), "observation_space_mapping": lambda walk: 0}
     sound(Walk, nothing)
 
 
-def test_check_accepts_labels_of_legal_actions_only():
+def test_check_simulation_accepts_labels_of_legal_actions_only():
     sound(Walk, {"action_labels": lambda walk: {0: "left"}})
 
 
@@ -427,7 +427,7 @@ class Tidy(Walk):
             os.chdir(folder)
 
 
-def test_check_reports_a_torch_grad_mode_set_by_the_model(monkeypatch):
+def test_check_simulation_reports_a_torch_grad_mode_set_by_the_model(monkeypatch):
     modes = [True]
     torch = types.SimpleNamespace(is_grad_enabled=lambda: modes[-1])
     monkeypatch.setitem(sys.modules, "torch", torch)
@@ -475,7 +475,9 @@ class Broken(Walk):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), WALKS)
-def test_check_reports_each_fault_with_its_place(model, changes, options, severity, words, told):
+def test_check_simulation_reports_each_fault_with_its_place(
+    model, changes, options, severity, words, told
+):
     report_with(model, changes, options, severity, words, told)
 
 
@@ -486,7 +488,7 @@ def left_out(report):
     return " ".join(line for line in report.checked if line.startswith("Left out"))
 
 
-def test_tests_that_are_left_out_are_named_with_the_reason():
+def test_check_simulation_names_skipped_checks_with_the_reason():
     assert not left_out(checked(Walk))
     errors = left_out(checked(Walk, {"observation_space": spaces.Box(-1, 1, (2,), np.float32)}))
     assert "PettingZoo's api_test, seed_test" in errors
@@ -501,7 +503,7 @@ def test_tests_that_are_left_out_are_named_with_the_reason():
     )
 
 
-def test_the_turn_view_is_left_out_where_spaces_cannot_be_united():
+def test_check_simulation_skips_turn_env_if_spaces_cannot_be_united():
     other = points(Walk, "rest", agent="rester_0", action_space=spaces.MultiBinary(3))
     report = check_simulation(Walk, points(Walk) | other, episodes=2)
     assert report.ok
@@ -510,7 +512,7 @@ def test_the_turn_view_is_left_out_where_spaces_cannot_be_united():
     assert "joint; drivers" in report.checked[0]
 
 
-def test_states_in_infos_are_an_option_of_the_check():
+def test_check_simulation_takes_state_in_info_as_an_option():
     class Charted(Walk):
         def state(self):
             return [self.place]

@@ -98,7 +98,7 @@ def clean(report):
     return report
 
 
-def test_check_of_a_sound_simulation_finds_nothing():
+def test_check_simulation_finds_nothing_in_a_sound_simulation():
     report = clean(checked(Walk))
     assert report.findings == ()
     assert "nothing to complain of" in str(report)
@@ -107,7 +107,7 @@ def test_check_of_a_sound_simulation_finds_nothing():
     assert any("Gymnasium's check_env (turn view)" in line for line in report.checked)
 
 
-def test_check_finds_nothing_in_sound_points_of_all_kinds():
+def test_check_simulation_finds_nothing_in_sound_points_of_all_kinds():
     design = WorldDesign(KINDS, tuple((number % 9, number % 3) for number in range(27)))
     functions = points_of(design)
     report = clean(check_simulation(lambda: World(design, functions), functions, episodes=4))
@@ -129,14 +129,14 @@ COLONY = entities.ColonyDesign(initial=4, most=10, ticks=6, overseen="before")
     ],
     ids=["greenhouse", "colony", "meadow"],
 )
-def test_check_finds_nothing_if_agents_are_born_and_die(simulation, points):
+def test_check_simulation_finds_nothing_if_agents_are_born_and_die(simulation, points):
     report = clean(check_simulation(simulation, points, episodes=2, max_steps=300, seeds=[5]))
     if simulation is GreenhouseSim:
         assert re.fullmatch(r"\(update_air_exchange choose_water_amount\)\{\d+\}", report.calls)
         assert [part.agents for part in report.statistics] == ["waterer_0", "ventilator_0"]
 
 
-def test_check_finds_nothing_in_masks_of_several_components():
+def test_check_simulation_finds_nothing_in_masks_of_several_components():
     changes = {
         "action_space": spaces.MultiDiscrete([3, 2]),
         "action_space_mapping": lambda action: int(action[0]) - 1,
@@ -154,7 +154,7 @@ def in_one_generator(seed):
     ("generators", "noted"),
     [(in_one_generator, ["1 for 3 agents, being_0 and being_1 among them"]), (Streams, [])],
 )
-def test_check_notes_entities_that_share_generators(generators, noted):
+def test_check_simulation_notes_entities_that_share_generators(generators, noted):
     def main(simulation):
         simulation.beings, simulation.generators = (
             list(map(entities.Being, range(3))),
@@ -183,7 +183,7 @@ def seen_by(walk):
     return walk.observe()
 
 
-def test_check_compares_only_the_given_fingerprint():
+def test_check_simulation_compares_only_the_given_fingerprint():
     clean(
         checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place)
     )
@@ -416,12 +416,12 @@ class Seeding(Global):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
-def test_faults_of_models_are_found(model, changes, options, severity, words, told):
+def test_check_simulation_finds_faults_of_models(model, changes, options, severity, words, told):
     report, seen = report_with(model, changes, options, severity, words, told)
     assert report.of("error") == ((seen,) if severity == "error" else ()), str(report)
 
 
-def test_statistics_describe_the_checked_episodes():
+def test_check_simulation_statistics_describe_the_checked_episodes():
     space = spaces.Dict({"still": spaces.Box(0, 1, (2,), np.float32), "which": spaces.Discrete(30)})
     changes = {
         "observation_space": space,
@@ -442,7 +442,7 @@ def test_statistics_describe_the_checked_episodes():
     assert "Episodes of random legal actions: 2 terminated" in str(report)
 
 
-def test_reports_read_as_text_with_the_most_important_first():
+def test_check_report_prints_the_most_important_findings_first():
     changes = {
         "observation_space": spaces.Box(-1, 1, (2,), np.float32),
         "reward_mapping": lambda walk: 0,
@@ -456,7 +456,7 @@ def test_reports_read_as_text_with_the_most_important_first():
     assert all(len(line) <= 110 or "/" in line for line in text.splitlines())
 
 
-def test_reports_survive_pickling_and_json():
+def test_check_report_survives_pickling_and_json():
     report = checked(Walk, {"action_mask_mapping": lambda walk: [1, len(walk.log) % 2, 0]})
     assert finding(report, "never legal").evidence == "actions 2"
     assert pickle.loads(pickle.dumps(report)) == report
@@ -467,7 +467,7 @@ def test_reports_survive_pickling_and_json():
     assert told["statistics"][0]["observations"][1]["name"] == "observation[1]"
 
 
-def test_errors_are_raised_as_assertions():
+def test_check_report_can_raise_its_errors_as_assertions():
     report = CheckReport(
         "Walk",
         (Finding("error", "It limps", "Mend it.", "at step 3"), Finding("note", "B", "C")),
@@ -479,7 +479,7 @@ def test_errors_are_raised_as_assertions():
     assert "NOTE" not in str(caught.value)
 
 
-def test_a_check_restores_generators_and_functions_in_silence(capsys):
+def test_check_simulation_restores_generators_and_functions(capsys):
     class Loud(Walk):
         def run(self):
             print("hello")
@@ -498,7 +498,7 @@ def test_a_check_restores_generators_and_functions_in_silence(capsys):
     assert vars(Walk)["choose"] is before
 
 
-def test_check_passes_options_and_points_to_its_environments():
+def test_check_simulation_passes_options_and_points_to_its_envs():
     report = check_simulation(
         Walk, points(Walk) | points(Walk, "rest", agent="rester_0"), episodes=3
     )
@@ -515,7 +515,7 @@ def test_check_passes_options_and_points_to_its_environments():
     assert [part.agents for part in report.statistics] == ["waterer_0"]
 
 
-def test_invalid_arguments_are_errors_of_the_caller():
+def test_check_simulation_refuses_invalid_arguments():
     with pytest.raises(SimulationError, match="is not a simulation"):
         check_simulation(3, points(Walk))
     with pytest.raises(UnknownPointError, match="cannot be found"):
@@ -531,7 +531,7 @@ def test_invalid_arguments_are_errors_of_the_caller():
             checked(Walk, **wrong)
 
 
-def test_the_time_limit_stops_the_check(monkeypatch):
+def test_check_simulation_stops_at_its_time_limit(monkeypatch):
     looks = itertools.count()
     # a second goes by between two looks
     monkeypatch.setattr(time, "monotonic", lambda: float(next(looks)))
@@ -540,7 +540,7 @@ def test_the_time_limit_stops_the_check(monkeypatch):
     assert next(looks) < 2000
 
 
-def test_inspection_shows_points_calls_and_the_end():
+def test_inspect_simulation_shows_points_calls_and_the_end():
     seen = inspect_simulation(GreenhouseSim)
     assert seen.calls == "(update_air_exchange choose_water_amount){9}"
     assert [point["agent"] for point in seen.points] == ["waterer_0", "ventilator_0"]
@@ -556,7 +556,7 @@ def test_inspection_shows_points_calls_and_the_end():
     assert f"Possible views: {views}" in str(seen)
 
 
-def test_inspection_shows_where_a_model_fails():
+def test_inspect_simulation_shows_where_a_model_fails():
     class Broken(Walk):
         def choose(self):
             return 1 // (3 - self.number)
@@ -580,7 +580,7 @@ def test_inspection_shows_where_a_model_fails():
         ),
     ],
 )
-def test_inspection_abbreviates_the_order_of_calls(calls, told):
+def test_inspect_simulation_abbreviates_the_order_of_calls(calls, told):
     assert order_of(calls) == told
 
 
@@ -608,7 +608,7 @@ def holding(**attributes):
         ([Thing(1)], [Thing(1), Thing(1)]),
     ],
 )
-def test_differences_finds_every_kind_of_change(one, other):
+def test_check_simulation_finds_every_kind_of_changed_attribute(one, other):
     assert differences(holding(it=one), holding(it=other))
 
 
@@ -623,17 +623,17 @@ def test_differences_finds_every_kind_of_change(one, other):
         lambda: np.array([None, 1], object),
     ],
 )
-def test_equal_models_have_no_differences(make):
+def test_check_simulation_finds_no_differences_between_equal_models(make):
     assert differences(holding(it=make()), holding(it=make())) == []
 
 
-def test_snapshot_handles_objects_that_refer_to_themselves():
+def test_check_simulation_compares_objects_that_refer_to_themselves():
     thing = Thing(1)
     thing.other = [thing]
     assert holding(it=thing)["simulation.it.other[0]"] == "the same object as simulation.it"
 
 
-def test_snapshot_reaches_attributes_after_a_long_list():
+def test_check_simulation_compares_attributes_after_a_long_list():
     history = [[number] * 10 for number in range(10_000)]
     one, other = (holding(history=history, thing=random.Random(seed)) for seed in (1, 2))
     assert len(one) >= MOST_PARTS
@@ -642,7 +642,7 @@ def test_snapshot_reaches_attributes_after_a_long_list():
     ]
 
 
-def test_episodes_are_counted_by_how_they_end():
+def test_check_simulation_counts_episodes_by_how_they_end():
     limited, endless = (
         variant("Limited", run=lambda walk: Walk.run(walk) or TRUNCATED),
         variant("Long", steps=10**9),
@@ -661,7 +661,7 @@ def doubled(walk, _result):
     [(Global, {"global_rng": True}), (Walk, {"plugins": [(doubled, Walk.choose, "after")]})],
     ids=["global generators of its own", "plugins"],
 )
-def test_a_plain_run_has_the_generators_and_plugins_of_environments(model, options):
+def test_check_simulation_runs_the_model_without_env_but_with_plugins(model, options):
     """Models that draw from everybody's are cured; what plugins change, they change on purpose."""
     report = clean(checked(model, **options))
     assert "plain runs against RULE" in report.checked[0]

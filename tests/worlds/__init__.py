@@ -1,1 +1,1 @@
-"""Models, definitions and players that the tests share."""
+"""Models that tests share; ``docs/contributing.md`` says which one to use for which test."""

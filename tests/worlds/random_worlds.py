@@ -179,6 +179,12 @@ def points_of(design):
     ]
 
 
+def world_policies(design, points):
+    """The policies of a design by point: some answer, others leave it to the rule."""
+    policies = {points[point]: world_policy for point in design.policies}
+    return policies | {points[point]: RULE for point in design.rules} or None
+
+
 def _point(kind, point, by_difference):
     def world_of(thing):
         return thing.world if isinstance(thing, Entity) else thing

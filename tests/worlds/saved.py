@@ -50,7 +50,7 @@ from tests.worlds.random_worlds import (
     Yard,
     YardDesign,
     points_of,
-    world_policy,
+    world_policies,
     yard_outcome,
 )
 from tests.worlds.random_worlds import WorldDesign as Program
@@ -61,6 +61,9 @@ HERE = __name__
 def yard(machines, jobs, cranes, plans, luck, until):
     """Make a yard, from arguments that a file has."""
     return Yard(YardDesign(machines, jobs, cranes, plans, luck, until))
+
+
+YARD = partial(yard, 3, 2, 2, 2, 3, None)
 
 
 class Depot:
@@ -246,11 +249,10 @@ def program(seed):
         policies=frozenset({1} if number > 2 else ()),
     )
     points = points_of(design)
-    policies = {points[point]: world_policy for point in design.policies}
     return {
         "simulation": partial(World, design, points),
         "points": points,
-        "policies": policies or None,
+        "policies": world_policies(design, points),
     }
 
 
@@ -285,6 +287,16 @@ def move(env, chance):
         action = RULE if chance.random() < 0.2 else action
     results = env.step(action)
     return repr(results), results[2] or results[3]
+
+
+def mid_episode(make=aec_env, simulation=YARD, points=YARD_POINTS, *, taken=6, seed=7, **options):
+    """Return an environment after some steps."""
+    env = make(simulation, points, **options)
+    env.reset(seed=seed)
+    chance = random.Random(1)
+    for _ in range(taken):
+        move(env, chance)
+    return env
 
 
 def future(env, seed, most=10_000):

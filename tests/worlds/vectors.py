@@ -16,9 +16,9 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vector_env
+from simenv_marl import TRUNCATED, joint_env, make_step, single_env, vector_env
 from tests.worlds.models import define
-from tests.worlds.random_worlds import World, agent_of, points_of, world_policy
+from tests.worlds.random_worlds import World, agent_of, points_of, world_policies
 
 MODES = list(AutoresetMode)
 
@@ -198,15 +198,12 @@ def agree(ours, theirs, steps, rng):
 def made(design, number, mode, *, sync=False, **options):
     """A vector environment of worlds of a design, ours or Gymnasium's; None if it is impossible."""
     points = points_of(design)
-    policies = {points[point]: world_policy for point in design.policies} | {
-        points[point]: RULE for point in design.rules
-    }
     entities = [
         point
         for point in design.active
         if agent_of(design.kinds[point], point, 0) != f"point_{point}"
     ]
-    options |= {"policies": policies or None, "max_steps": design.max_steps}
+    options |= {"policies": world_policies(design, points), "max_steps": design.max_steps}
     if entities:
         names = {p: [agent_of(design.kinds[p], p, entity) for entity in range(3)] for p in entities}
         options["possible_agents"] = {points[p]: list(filter(None, names[p])) for p in entities}

@@ -103,7 +103,7 @@ def fits(page):
 
 
 @pytest.mark.parametrize("model", [GREENHOUSE, QUEUE])
-def test_a_decision_is_on_one_screen_of_a_phone(open_page, start, model):
+def test_play_page_shows_a_decision_on_one_screen_of_a_phone(open_page, start, model):
     server = start("--seed", "3", "--title", "A day in the greenhouse", simulation=model)
     seat = "ventilator_0" if model == GREENHOUSE else "admission_0"
     page = open_page(server, seat, **PHONE)
@@ -115,7 +115,7 @@ def test_a_decision_is_on_one_screen_of_a_phone(open_page, start, model):
     assert server.end()[0] == 0
 
 
-def test_two_people_play_the_greenhouse(open_page, start, tmp_path):
+def test_play_page_lets_two_people_play_the_greenhouse(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
     server = start("--seed", "3", "--record", str(path), simulation=GREENHOUSE)
     airing = open_page(server, "ventilator_0", color_scheme="dark", **PHONE)
@@ -191,7 +191,7 @@ def free_port():
         return listener.getsockname()[1]
 
 
-def test_two_people_and_a_policy_go_on_after_a_crash(open_page, start, tmp_path):
+def test_play_page_continues_the_game_after_a_crash_of_the_server(open_page, start, tmp_path):
     path, port = tmp_path / "game.jsonl", str(free_port())
     arguments = [
         "--seat", "trader_0", "trader_1", "--policy", "trader_2=tests.worlds.seats:five",
@@ -245,7 +245,7 @@ def test_two_people_and_a_policy_go_on_after_a_crash(open_page, start, tmp_path)
     assert set(found["trader_2"].actions.tolist()) == {5}
 
 
-def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, start):
+def test_play_page_takes_keys_for_cards_and_grids_and_escapes_texts(open_page, start):
     server = start("--seed", "3", "--limit", "300")
     buyer, seller = open_page(server, "buyer"), open_page(server, "seller")
     wait_for_turn(buyer)
@@ -280,7 +280,7 @@ def test_cards_and_grids_are_played_by_keys_and_texts_are_no_markup(open_page, s
     assert server.end()[0] == 0
 
 
-def test_page_reports_a_slow_model_and_ignores_double_clicks(open_page, start, tmp_path):
+def test_play_page_reports_a_slow_model_and_ignores_double_clicks(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
     server = start("--record", str(path), simulation="tests.worlds.seats:SlowShop")
     page = open_page(server, "buyer")
@@ -299,7 +299,7 @@ def test_page_reports_a_slow_model_and_ignores_double_clicks(open_page, start, t
     assert server.end()[0] == 0
 
 
-def test_page_shows_the_last_seconds_and_rejects_a_wrong_key(open_page, start):
+def test_play_page_shows_the_last_seconds_and_rejects_a_wrong_key(open_page, start):
     server = start("--limit", "11", "--tools", "facilitator", "--seat", "buyer")
     page = open_page(server, "buyer", **PHONE)
     page.wait_for_selector("#clock.late")
@@ -316,7 +316,7 @@ def test_page_shows_the_last_seconds_and_rejects_a_wrong_key(open_page, start):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_seats_with_any_name_are_played(open_page, start, scheme):
+def test_play_page_works_for_agents_with_special_characters_in_names(open_page, start, scheme):
     server = start("--seed", "1", simulation="tests.worlds.seats:OddShop")
     lobby = open_page(server, "", color_scheme=scheme)
     lobby.get_by_text("Take").first.click()

@@ -106,7 +106,7 @@ def as_by_hand(actions):
     return models.play(env, {"buyer": iter(actions), "seller": RULE}, seed=5), env.simulation.profit
 
 
-def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_host):
+def test_play_game_equals_an_env_episode_and_its_end_can_be_undone(make_host):
     """The rule decides for agents without a person."""
     actions = [3, 1, 0, 2, 1, 1, 0, 2]
     host = make_host()
@@ -146,7 +146,7 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ho
 
 
 @pytest.mark.parametrize("forks", [True, False])
-def test_jump_undo_and_redo_lead_to_the_same_decisions(make_host, forks, monkeypatch):
+def test_play_game_jump_undo_and_redo_lead_to_the_same_decisions(make_host, forks, monkeypatch):
     monkeypatch.setattr("simenv_marl.seats.play.game.CHECKPOINTS", 4)
     host = make_host()
     host.game.can_fork = forks
@@ -177,7 +177,7 @@ def test_jump_undo_and_redo_lead_to_the_same_decisions(make_host, forks, monkeyp
     assert host.game.notice == ""
 
 
-def test_seat_whose_agent_never_decides_is_reported_at_the_end(make_host):
+def test_play_game_reports_a_persons_agent_that_never_decides(make_host):
     class Open(Shop):
         """Its agents are known when they decide."""
 
@@ -189,7 +189,7 @@ def test_seat_whose_agent_never_decides_is_reported_at_the_end(make_host):
     assert host.game.notice == "No decision was one of buier; buyer decided."
 
 
-def test_illegal_and_untimely_messages_get_a_reply_and_change_nothing(make_host):
+def test_play_game_answers_illegal_messages_and_stays_unchanged(make_host):
     host = make_host(seats=())
     settle(host)
     wrong = [
@@ -216,7 +216,7 @@ def test_illegal_and_untimely_messages_get_a_reply_and_change_nothing(make_host)
     assert not host.game.root.agents  # it is closed in the end
 
 
-def test_futures_are_tried_out_without_moving_the_game(make_host):
+def test_play_game_tries_futures_without_moving_the_game(make_host):
     host = make_host()
     settle(host)
     fan = think(host)
@@ -234,7 +234,7 @@ def test_futures_are_tried_out_without_moving_the_game(make_host):
     assert (host.game.turn, host.game.env.simulation.day) == (0, 0)
 
 
-def test_without_reseed_there_is_one_future_and_a_note(make_host):
+def test_play_game_shows_one_future_of_a_model_without_reseed(make_host):
     host = make_host(FixedShop)
     settle(host)
     fan = think(host)
@@ -244,7 +244,7 @@ def test_without_reseed_there_is_one_future_and_a_note(make_host):
     assert host.game.returns["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
 
 
-def test_observations_and_actions_have_a_form_in_json():
+def test_play_game_shows_observations_and_actions_as_json():
     assert jsonable({1: np.array([np.inf, 1.5]), "time": -np.inf}) == {
         "1": ["inf", 1.5],
         "time": "-inf",
@@ -256,7 +256,7 @@ def test_observations_and_actions_have_a_form_in_json():
     assert action_of(pair, [1]) == [1]  # which the environment refuses
 
 
-def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_host):
+def test_play_game_tries_a_persons_own_legal_action_in_futures(make_host):
     host = make_host(seats=("seller",))
     settle(host)
     assert [one["action"] for one in think(host)["candidates"]] == [None]
@@ -271,7 +271,7 @@ def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_host):
     assert (think(host)["horizon"], think(host)["by_time"]) == (2, False)
 
 
-def test_decision_ends_the_evaluation_of_futures(make_host):
+def test_play_game_stops_its_futures_when_a_person_decides(make_host):
     host = make_host()
     connection = Connection(
         (1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"})
@@ -286,7 +286,7 @@ def test_decision_ends_the_evaluation_of_futures(make_host):
     assert len(host.game.timeline) > 1
 
 
-def test_rule_plays_for_delegated_seats_and_for_empty_ones(make_host):
+def test_play_game_lets_the_models_rule_play_for_absent_people(make_host):
     host = make_host(seats=())
     settle(host)
     host.handle("buyer", {"do": "delegate", "n": 2})
@@ -307,7 +307,7 @@ def test_rule_plays_for_delegated_seats_and_for_empty_ones(make_host):
     assert settle(host)["pending"]["agent"] == "buyer"  # the skip ended at the seller's turn
 
 
-def test_after_the_limit_the_rule_decides_and_is_counted(make_host, monkeypatch):
+def test_play_game_lets_the_models_rule_decide_after_the_time_limit(make_host, monkeypatch):
     host = make_host(limit=30.0)
     assert settle(host)["left"] is None  # nobody is there
     assert not host.handle(None, {"taken": ["buyer"]})  # the game stays as it is
@@ -321,7 +321,7 @@ def test_after_the_limit_the_rule_decides_and_is_counted(make_host, monkeypatch)
     assert (host.game.timeline[0]["action"], host.game.timeline[0]["by"]) == (None, "limit")
 
 
-def test_errors_of_model_and_labels_end_the_episode_and_can_be_undone(make_host):
+def test_play_game_can_undo_an_error_of_the_model(make_host):
     host = make_host(BreakingShop)
     assert "the till is broken" in play(host, [1, 3])["over"]
     host.handle("buyer", {"do": "undo"})
@@ -333,7 +333,7 @@ def test_errors_of_model_and_labels_end_the_episode_and_can_be_undone(make_host)
     assert settle(host)["turn"] == 2
 
 
-def test_pictures_are_sent_as_png(make_host):
+def test_play_game_sends_rendered_pictures_as_png(make_host):
     host = make_host()
     play(host, [1])
     data = b64decode(settle(host)["picture"]["png"])
@@ -344,7 +344,7 @@ def test_pictures_are_sent_as_png(make_host):
     assert zlib.decompress(data[begin + 4 : begin + 4 + length]) == (b"\0" + b"\1" * 9) * 2
 
 
-def test_recording_replays_exactly_and_omits_undone_decisions(make_host, tmp_path):
+def test_play_recording_repeats_the_game_without_undone_decisions(make_host, tmp_path):
     host = make_host(seats=(), record=tmp_path / "game.jsonl")
     for _ in range(3):
         settle(host)
@@ -373,7 +373,7 @@ def test_recording_replays_exactly_and_omits_undone_decisions(make_host, tmp_pat
     assert found["buyer"].terminations[-1]
 
 
-def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_host, tmp_path):
+def test_play_recording_becomes_data_of_all_episodes(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     head = json.loads(path.read_text())
@@ -398,7 +398,7 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ho
         replay(path, Shop)
 
 
-def test_a_recording_has_agents_that_end_before_others(make_host, tmp_path):
+def test_play_recording_contains_agents_that_end_before_others(make_host, tmp_path):
     class Closing(Shop):
         def run(self):
             self.days = 2
@@ -415,7 +415,7 @@ def test_a_recording_has_agents_that_end_before_others(make_host, tmp_path):
     }
 
 
-def test_recording_that_cannot_be_written_is_reported_in_the_game(make_host, tmp_path):
+def test_play_game_reports_a_recording_that_cannot_be_written(make_host, tmp_path):
     host = make_host(record=tmp_path / "game.jsonl")
     (tmp_path / "game.jsonl").unlink()
     (tmp_path / "game.jsonl").mkdir()
@@ -426,7 +426,7 @@ def test_recording_that_cannot_be_written_is_reported_in_the_game(make_host, tmp
         make_host(record=tmp_path / "missing" / "game.jsonl")
 
 
-def test_history_keeps_the_labels_of_each_past_decision(make_host):
+def test_play_game_history_keeps_the_labels_of_each_past_decision(make_host):
     host = make_host(BreakingShop, unit="day")
     state = play(host, [2, 1])
     words = [(row["agent"], row["words"], row["when"]) for row in state["history"]]
@@ -439,7 +439,7 @@ def test_history_keeps_the_labels_of_each_past_decision(make_host):
     assert [row["words"] for row in settle(host)["history"]] == ["order 2 of 1", "order 1 of 1"]
 
 
-def test_situation_has_label_and_history_of_each_component(make_host):
+def test_play_game_shows_label_and_history_of_each_observed_component(make_host):
     many = replace(
         ORDER,
         observation_space=spaces.Box(-np.inf, np.inf, (20,)),
@@ -457,7 +457,7 @@ def test_situation_has_label_and_history_of_each_component(make_host):
         assert entry["past"] == [place, place + 1, place + 2]
 
 
-def test_game_page_shows_the_display_in_place_of_the_observation(make_host):
+def test_play_game_shows_display_mapping_instead_of_the_observation(make_host):
     shown = replace(
         ORDER, question="How much?", display_mapping=lambda shop: {"day": f"{shop.day} d"}
     )
@@ -474,7 +474,7 @@ def test_game_page_shows_the_display_in_place_of_the_observation(make_host):
     assert think(host)["measures"] == ["your points", "day"]
 
 
-def test_futures_of_all_answers_have_the_same_duration(make_host):
+def test_play_game_futures_of_all_actions_have_the_same_duration(make_host):
     class Mill(Works):
         points = points()
 
@@ -513,7 +513,7 @@ class Till:
 @pytest.mark.parametrize(
     ("hold", "points"), [({}, 2), ({"hold": 2}, 4), ({"hold": 4}, 6), ({"hold": None}, 8)]
 )
-def test_futures_hold_answers_where_they_are_legal(make_host, hold, points):
+def test_play_game_futures_repeat_a_held_action_where_it_is_legal(make_host, hold, points):
     host = make_host(Till, seats=("clerk",))
     settle(host)
     host.handle("clerk", {"do": "horizon", "n": 5, **hold})
@@ -524,7 +524,7 @@ def test_futures_hold_answers_where_they_are_legal(make_host, hold, points):
 
 
 @pytest.mark.parametrize("hold", [0, 101, 1.5, True, "2"])
-def test_futures_refuse_a_wrong_hold(make_host, hold):
+def test_play_game_futures_refuse_an_invalid_hold(make_host, hold):
     host = make_host(Till, seats=("clerk",))
     settle(host)
     with pytest.raises(OptionValueError, match="hold must be"):
@@ -532,7 +532,7 @@ def test_futures_refuse_a_wrong_hold(make_host, hold):
 
 
 @pytest.mark.thorough
-def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
+def test_play_game_futures_use_the_models_time_and_can_be_cancelled(make_host):
     host = make_host()
     settle(host)
     fan = think(host)
@@ -553,7 +553,7 @@ def test_futures_go_by_time_where_there_is_one_and_can_be_abandoned(make_host):
     assert time.monotonic() - begin < 2
 
 
-def test_restart_of_a_game_can_be_undone(make_host, tmp_path):
+def test_play_game_restart_can_be_undone(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     before = play(host, [1, 3])
@@ -567,7 +567,7 @@ def test_restart_of_a_game_can_be_undone(make_host, tmp_path):
     assert [len(each.decisions) for each in read(path)] == [6]
 
 
-def test_recording_resumes_at_its_last_decision(make_host, tmp_path):
+def test_play_recording_resumes_at_its_last_decision(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
     play(host, [1, 3, 2])
@@ -592,7 +592,7 @@ def test_recording_resumes_at_its_last_decision(make_host, tmp_path):
     assert len(read(path)) == 2
 
 
-def test_recording_catches_up_after_a_failed_write(make_host, tmp_path, monkeypatch):
+def test_play_recording_is_complete_after_a_failed_write(make_host, tmp_path, monkeypatch):
     path = tmp_path / "game.jsonl"
     host = make_host(record=path)
     path.rename(tmp_path / "kept")
@@ -605,7 +605,7 @@ def test_recording_catches_up_after_a_failed_write(make_host, tmp_path, monkeypa
     assert [line["turn"] for line in read(path)[0].decisions] == [0, 1, 2, 3]
 
 
-def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
+def test_play_game_returns_are_right_after_undo_past_an_end(make_host):
     class Closing(Shop):
         def run(self):
             self.days = 3
@@ -630,7 +630,7 @@ def test_returns_are_right_after_undo_and_redo_past_an_end(make_host):
         assert (state["turn"], state["returns"]) == (turn, states[turn]["returns"])
 
 
-def test_policy_of_a_seat_decides_and_its_errors_are_reported(make_host):
+def test_play_game_policy_of_an_agent_decides_and_its_errors_are_shown(make_host):
     async def policy(observation, *, _decision):
         assert not _decision.in_clone
         return [1, 2]
@@ -654,7 +654,7 @@ def test_policy_of_a_seat_decides_and_its_errors_are_reported(make_host):
     assert "illegally" in play(make_host(policies={"seller": lambda _: [5, 5]}), [1])["ending"]
 
 
-def test_joint_and_turn_policies_decide_in_seats(make_host):
+def test_play_game_accepts_joint_and_turn_policies(make_host):
     env = simenv_marl.joint_env(Shop)
     both = joint_policy(lambda observation: {"buyer": 2, "seller": [0, 1]}, like=env)
     host = make_host(seats=("buyer",), policies=both)
@@ -662,7 +662,7 @@ def test_joint_and_turn_policies_decide_in_seats(make_host):
     assert [row["action"] for row in history] == [1, [0, 1], 3, [0, 1]]
 
 
-def test_game_describes_its_end_and_compares_it_with_the_rule(make_host):
+def test_play_game_compares_its_end_with_the_models_rule(make_host):
     host = make_host(options={"max_steps": 6})
     state = play(host, [1, 3, 0])
     assert (state["over"], state["ending"]) == ("truncated", "Time is up.")
@@ -680,7 +680,7 @@ def test_game_describes_its_end_and_compares_it_with_the_rule(make_host):
 
 
 @pytest.mark.parametrize("finished", [False, True])
-def test_resumed_game_compares_with_the_rule_from_the_first_decision(make_host, tmp_path, finished):
+def test_play_game_resumed_compares_with_the_rule_from_the_start(make_host, tmp_path, finished):
     path = tmp_path / "game.jsonl"
     game = make_host(record=path).game
     while not game.over and (finished or len(game.timeline) < 6):
@@ -698,7 +698,7 @@ def test_resumed_game_compares_with_the_rule_from_the_first_decision(make_host, 
     assert compared["totals"]["buyer"] == plain.game.returns["buyer"]
 
 
-def test_undo_is_refused_to_seats_without_the_facilitators_tools(make_host):
+def test_play_game_allows_undo_only_to_the_facilitator(make_host):
     host = make_host(tools="facilitator")
     play(host, [1])
     with pytest.raises(InvalidActionError, match="facilitator"):
@@ -709,7 +709,7 @@ def test_undo_is_refused_to_seats_without_the_facilitators_tools(make_host):
         make_host(tools="nurse")
 
 
-def test_click_for_an_earlier_state_changes_nothing(make_host):
+def test_play_game_ignores_a_click_for_an_earlier_state(make_host):
     host = make_host()
     state = play(host, [1, 2])
     for _ in range(2):
@@ -717,7 +717,7 @@ def test_click_for_an_earlier_state_changes_nothing(make_host):
     assert settle(host)["turn"] == 2
 
 
-def test_numbers_that_json_lacks_never_leave_the_game(make_host):
+def test_play_game_never_sends_nan_or_infinity(make_host):
     class Wild(Shop):
         points = {  # noqa: RUF012
             Shop.order: replace(
@@ -752,7 +752,7 @@ def test_numbers_that_json_lacks_never_leave_the_game(make_host):
         (spaces.Text(3), "four", "Enter at most 3 characters, not 'four'."),
     ],
 )
-def test_complaint_about_an_action_uses_the_words_of_its_form(space, action, text):
+def test_play_game_refuses_an_action_in_the_words_of_its_form(space, action, text):
     form = form_of(space, None, None)
     assert complaint_about(form, action)["text"] == text
     legal = jsonable(space.sample())
@@ -760,14 +760,14 @@ def test_complaint_about_an_action_uses_the_words_of_its_form(space, action, tex
     assert words_of(form, legal)
 
 
-def test_masked_actions_are_hidden_and_values_have_four_digits():
+def test_play_game_hides_masked_actions_and_rounds_values():
     form = form_of(spaces.Discrete(4), np.array([1, 0, 1, 0], np.int8), {0: "no", 2: "two"})
     assert form == {"cards": [{"action": 0, "text": "no"}, {"action": 2, "text": "two"}]}
     texts = [shown(value) for value in (1 / 3, 1234.56, 123456.7, 1e-7, 12, True, np.float32(0.1))]
     assert texts == ["0.3333", "1235", "123457", "1e-07", "12", "yes", "0.1"]
 
 
-def test_recording_of_a_finished_game_resumes_at_its_end(make_host, tmp_path):
+def test_play_recording_of_a_finished_game_resumes_at_its_end(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     over = play(make_host(record=path), [2] * 8)
     moments = {"moment": 0, "event": ""}
@@ -785,7 +785,7 @@ def places_of(env):
     return state, [*env.agents], env.agents and repr(env.last())
 
 
-def test_a_recording_is_the_file_of_an_episode(make_host, tmp_path):
+def test_play_recording_is_an_episode_file_that_load_episode_reads(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     host = make_host(seats=(), record=path, policies={"seller": lambda observation: [0, 1]})
     host.game.restart(9)
@@ -811,7 +811,7 @@ def test_a_recording_is_the_file_of_an_episode(make_host, tmp_path):
     assert load_episode(path).session.seed == 9
 
 
-def test_a_recording_after_an_error_is_loaded_before_it(make_host, tmp_path):
+def test_play_recording_after_an_error_is_loaded_before_the_error(make_host, tmp_path):
     host = make_host(BreakingShop, record=tmp_path / "game.jsonl")
     assert "the till is broken" in play(host, [1, 3])["over"]
     loaded = load_episode(tmp_path / "game.jsonl")
@@ -819,7 +819,7 @@ def test_a_recording_after_an_error_is_loaded_before_it(make_host, tmp_path):
         loaded.step(3)
 
 
-def test_the_ends_of_agents_are_in_the_recording(make_host, tmp_path):
+def test_play_recording_contains_the_ends_of_agents(make_host, tmp_path):
     host = make_host(ClosingShop, seats=(), record=tmp_path / "game.jsonl")
     for _ in range(4):
         settle(host)
@@ -840,7 +840,7 @@ OLD = [
 
 
 @pytest.mark.thorough
-def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
+def test_play_recording_of_an_older_version_is_resumed(make_host, tmp_path):
     path = tmp_path / "game.jsonl"
     before = make_host(seats=())
     play(before, [1])
@@ -864,7 +864,7 @@ def test_a_recording_of_an_older_version_is_resumed(make_host, tmp_path):
         make_host(record=path, options={"max_steps": 3})
 
 
-def test_other_files_of_episodes_are_no_recordings(make_host, tmp_path):
+def test_play_refuses_an_episode_file_as_its_recording(make_host, tmp_path):
     env = aec_env(Shop)
     env.reset(seed=1)
     save_episode(env, tmp_path / "episode")

@@ -19,21 +19,20 @@ from simenv_marl.errors import EpisodeFileError
 from simenv_marl.seats.play.host import Rules
 from simenv_marl.seats.play.start import open_game
 from tests.files.test_episodes import Reseeded
-from tests.worlds import saved
 from tests.worlds.random_worlds import HERE as YARDS
 from tests.worlds.random_worlds import YARD_POINTS, Yard, yard_outcome, yard_policy
-from tests.worlds.saved import VANS, Depot, Pumps, cases, move, pushing, save, steady
-
-YARD = saved.partial(saved.yard, 3, 2, 2, 2, 3, None)
-
-
-def begun(make, simulation, points, taken=6, **options):
-    env = make(simulation, points, **options)
-    env.reset(seed=7)
-    chance = random.Random(1)
-    for _ in range(taken):
-        move(env, chance)
-    return env
+from tests.worlds.saved import (
+    VANS,
+    YARD,
+    Depot,
+    Pumps,
+    cases,
+    mid_episode,
+    move,
+    pushing,
+    save,
+    steady,
+)
 
 
 def open_at(path, until=None):
@@ -68,8 +67,8 @@ def state_of(simulation):
         (single_env, Pumps, None, {"agent": "push", "policies": {"pull": steady}}),
     ],
 )
-def test_opened_game_is_at_the_decision_of_its_file(make, simulation, points, options, tmp_path):
-    env = begun(make, simulation, points, **options)
+def test_play_opens_an_episode_file_at_its_decision(make, simulation, points, options, tmp_path):
+    env = mid_episode(make, simulation, points, **options)
     save_episode(env, tmp_path / "a")
     game = open_at(tmp_path / "a")
     pending = env.unwrapped.episode.pending
@@ -82,18 +81,18 @@ def test_opened_game_is_at_the_decision_of_its_file(make, simulation, points, op
     game.close()
 
 
-def test_a_game_begins_after_so_many_decisions(tmp_path):
-    save_episode(begun(aec_env, YARD, YARD_POINTS), tmp_path / "a")
+def test_play_opens_an_episode_file_after_a_given_number_of_decisions(tmp_path):
+    save_episode(mid_episode(), tmp_path / "a")
     game = open_at(tmp_path / "a", until=3)
-    env = begun(aec_env, YARD, YARD_POINTS, taken=3)
+    env = mid_episode(taken=3)
     assert (game.turn, game.now["agent"]) == (3, env.agent_selection)
     assert state_of(game.root.simulation) == state_of(env.simulation)
     game.close()
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_opened_game_of_a_finished_file_is_at_its_end(make, tmp_path):
-    env = begun(make, Pumps, None, taken=0)
+def test_play_opens_a_finished_episode_file_at_its_end(make, tmp_path):
+    env = mid_episode(make, Pumps, None, taken=0)
     while not env.unwrapped.episode.over:
         move(env, random.Random(1))
     save_episode(env, tmp_path / "a")
@@ -103,7 +102,7 @@ def test_opened_game_of_a_finished_file_is_at_its_end(make, tmp_path):
     game.close()
 
 
-def test_opened_game_keeps_the_reset_options_of_its_file(tmp_path):
+def test_play_keeps_the_reset_options_of_an_opened_file(tmp_path):
     env = aec_env(Pumps, max_steps=3)
     env.reset(seed=1, options={"level": [4, 5]})
     env.step(RULE)
@@ -116,8 +115,8 @@ def test_opened_game_keeps_the_reset_options_of_its_file(tmp_path):
     game.close()
 
 
-def test_a_game_of_a_reseeded_clone_is_refused(tmp_path):
-    env = begun(aec_env, Reseeded, None, taken=2)
+def test_play_refuses_the_episode_file_of_a_reseeded_clone(tmp_path):
+    env = mid_episode(aec_env, Reseeded, None, taken=2)
     save_episode(clone(env, seed=5), tmp_path / "a")
     with pytest.raises(EpisodeFileError, match="drawn anew"):
         open_at(tmp_path / "a")
@@ -126,7 +125,7 @@ def test_a_game_of_a_reseeded_clone_is_refused(tmp_path):
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("seed", range(0, 60, 20))
-def test_opened_games_of_random_worlds_are_at_the_decision_of_the_file(seed, tmp_path):
+def test_play_opens_episode_files_of_random_models_at_their_decision(seed, tmp_path):
     for number in range(seed, seed + 20):
         case = cases(random.Random(number))
         if case.given is not dict:  # it has no name

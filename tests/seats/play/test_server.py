@@ -145,7 +145,7 @@ def buyer(page):
     return buyer
 
 
-def test_two_people_play_and_a_spectator_sees_it():
+def test_play_server_shows_a_spectator_the_game_of_two_people():
     server = Server("--seed", "5")  # which nobody else has used
     buyer, seller, spectator = server.page("buyer"), server.page("seller"), server.page()
     everybody = {"buyer": 1, "seller": 1}
@@ -169,7 +169,7 @@ def test_two_people_play_and_a_spectator_sees_it():
     assert server.end()[0] == 0
 
 
-def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer):
+def test_play_server_ignores_messages_without_the_agents_key(server, page, buyer):
     (key,) = server.keys("seller")
     for stranger in (
         page("buyer", key),
@@ -196,7 +196,7 @@ def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer
     assert page().wait("state")["turn"] == 0
 
 
-def test_an_illegal_action_comes_back_as_text(buyer):
+def test_play_server_answers_an_illegal_action_with_a_text(buyer):
     buyer.send(do="act", turn=0, action=17)
     assert "17" in buyer.wait("error")["text"]
     for action in (
@@ -229,13 +229,13 @@ def test_an_illegal_action_comes_back_as_text(buyer):
         {"Host": "[::1"},
     ],
 )
-def test_another_host_is_refused(server, headers):
+def test_play_server_refuses_requests_for_another_host(server, headers):
     with pytest.raises(HTTPError, match="403") as caught:
         urlopen(Request(server.base, headers=headers), timeout=60)
     caught.value.close()
 
 
-def test_server_refuses_other_origins_and_serves_all_its_pages(server):
+def test_play_server_refuses_other_origins_and_serves_all_its_pages(server):
     with pytest.raises(InvalidStatus):
         server.page(additional_headers={"Origin": "http://evil.example"})
     for path in ("", "seat/buyer?key=x", "page.js", "page.css"):
@@ -246,7 +246,7 @@ def test_server_refuses_other_origins_and_serves_all_its_pages(server):
 
 
 @pytest.mark.thorough
-def test_a_flood_from_one_page_does_not_keep_another_from_playing(page, buyer):
+def test_play_server_serves_others_while_one_page_floods_it(page, buyer):
     flood = page("seller")
     flood.socket.socket.settimeout(0.2)
     with suppress(TimeoutError, ConnectionClosed):  # nobody reads so fast
@@ -256,7 +256,7 @@ def test_a_flood_from_one_page_does_not_keep_another_from_playing(page, buyer):
     buyer.wait_for_turn(1)
 
 
-def test_many_connections_end_old_spectators_and_no_player(server, page, buyer):
+def test_play_server_with_many_connections_drops_old_spectators_first(server, page, buyer):
     idle = [socket.create_connection(server.host.split(":"), timeout=60) for _ in range(60)]
     spectators = [page() for _ in range(70)]
     assert spectators[0].wait_for_the_end() == 1013  # try again later
@@ -266,7 +266,7 @@ def test_many_connections_end_old_spectators_and_no_player(server, page, buyer):
     buyer.wait_for_turn(1)
 
 
-def test_a_page_that_is_gone_leaves_no_task_and_no_link():
+def test_play_server_keeps_no_task_of_a_closed_page():
     async def visit():
         table = Table(None, {"type": "state"}, print)
         await table.serve(page)
@@ -280,14 +280,14 @@ def test_a_page_that_is_gone_leaves_no_task_and_no_link():
 
 
 @pytest.mark.thorough
-def test_a_game_that_takes_long_is_killed_in_the_end():
+def test_play_server_kills_a_game_that_does_not_end():
     server = Server("--seat", "buyer", simulation="tests.worlds.seats:EndlessShop")
     server.page("buyer").wait("state")
     assert server.end()[0] == 0
 
 
 @pytest.mark.thorough
-def test_the_end_leaves_no_process(tmp_path):
+def test_play_server_leaves_no_process_when_it_ends(tmp_path):
     arguments = "--seat", "buyer", "--record", str(tmp_path / "game.jsonl")
     server = Server(*arguments, simulation="tests.worlds.seats:ClosedShop")
     buyer = server.page("buyer")
@@ -303,7 +303,7 @@ def test_the_end_leaves_no_process(tmp_path):
 
 
 @pytest.mark.thorough
-def test_the_end_of_the_game_ends_the_server():
+def test_play_server_ends_with_its_game():
     server = Server()
     (game,) = [
         child
@@ -359,7 +359,7 @@ def test_play_function_takes_the_arguments_of_simulate(monkeypatch, tmp_path):
     ]
 
 
-def test_a_game_of_the_command_line_has_policies():
+def test_play_command_lets_policies_play_other_agents():
     found = {"shop": Shop, "five": five, "both": {"seller": five}}
     options = {"rules": Rules(""), "seed": 1, "name": "", "seats": ()}
     for text in ("seller=five", "both"):
@@ -371,7 +371,7 @@ def test_a_game_of_the_command_line_has_policies():
 
 
 @pytest.mark.thorough
-def test_a_resumed_game_has_the_same_links(tmp_path):
+def test_play_server_gives_a_resumed_game_the_same_links(tmp_path):
     arguments = "--seed", "5", "--record", str(tmp_path / "game.jsonl")
     server = Server(*arguments)
     buyer = server.page("buyer")
@@ -388,7 +388,7 @@ def test_a_resumed_game_has_the_same_links(tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_file_of_an_episode_is_opened_at_a_decision(tmp_path):
+def test_play_command_opens_an_episode_file_at_a_decision(tmp_path):
     env = parallel_env(Shop)
     env.reset(seed=5)
     for amount in (2, 1, 0):
@@ -408,7 +408,7 @@ def test_a_file_of_an_episode_is_opened_at_a_decision(tmp_path):
     assert main(["replay", str(tmp_path / "saved"), "--play", "--port", "0"]) == 2
 
 
-def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):
+def test_play_lobby_gives_a_player_a_free_agent(page):
     lobby = page()
     lobby.send(do="claim", key="")
     lobby.wait("error")
@@ -423,7 +423,7 @@ def test_the_lobby_gives_a_free_seat_and_no_taken_one(page):
 
 
 @pytest.mark.thorough
-def test_the_lobby_never_gives_the_link_of_the_facilitator():
+def test_play_lobby_never_gives_the_facilitators_link():
     server = Server("--tools", "facilitator")
     lobby = server.page()
     lobby.socket.send(json.dumps({"do": "claim", "seat": ""}))
@@ -432,7 +432,7 @@ def test_the_lobby_never_gives_the_link_of_the_facilitator():
     assert server.end()[0] == 0
 
 
-def test_a_number_that_is_too_large_never_returns_as_infinity(buyer):
+def test_play_server_never_sends_a_too_large_number_as_infinity(buyer):
     buyer.socket.send(
         json.dumps({"key": buyer.key, "do": "act", "turn": 0, "action": 0}).replace(
             ": 0}", ": 1e999}"
@@ -447,7 +447,7 @@ def test_play_command_names_a_missing_extra(monkeypatch, capsys):
     assert "play needs uvicorn: install simenv-marl[play]" in capsys.readouterr().err
 
 
-def test_the_command_line_imports_the_server_only_to_play():
+def test_command_line_imports_the_play_server_only_to_play():
     names = ("starlette", "uvicorn", "websockets")
     code = (
         "import simenv_marl.__main__, sys; "

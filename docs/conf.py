@@ -47,7 +47,7 @@ html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"top_of_page_buttons": []}
 
-MOST_SECTIONS_UNLISTED = 5
+MOST_SECTIONS_UNLISTED = 3
 
 
 def _trim(app, doctree):
@@ -150,7 +150,8 @@ def _list_sections(app, pagename, templatename, context, doctree):
     """List the sections of a long page at its top, for screens without room beside the text."""
     toc = context.get("toc", "")
     sections = toc.count("<li>") - toc.count("><code")  # without the names in the reference
-    if doctree is not None and sections > MOST_SECTIONS_UNLISTED:
+    shown = doctree is not None and "hide-toc" not in context["meta"]
+    if shown and sections > MOST_SECTIONS_UNLISTED:
         listed = f'<details class="sections" open><summary>On this page</summary>{toc}</details>'
         context["body"] = context["body"].replace("</h1>", f"</h1>\n{listed}", 1)
 

@@ -48,6 +48,7 @@ html_show_copyright = False
 html_theme_options = {"top_of_page_buttons": []}
 
 MOST_SECTIONS_UNLISTED = 3
+COLUMNS = {"difference", "first"}  # of tables of experiments, and also names of functions
 
 
 def _trim(app, doctree):
@@ -109,7 +110,8 @@ class LinkNames(SphinxPostTransform):
         entries = _entries_by_name(self.env.domains.python_domain.objects)
         for code in list(self.document.findall(nodes.literal)):
             entry = entries.get(code.astext().removesuffix("()"))
-            if entry and not _is_linked(code, entry.node_id):
+            is_column = code.astext() in COLUMNS and self.env.docname == "reference/experiments"
+            if entry and not is_column and not _is_linked(code, entry.node_id):
                 place = (self.env.docname, entry.docname, entry.node_id)
                 code.replace_self(make_refnode(self.app.builder, *place, code.deepcopy()))
 

@@ -145,7 +145,8 @@ def _shorten(app, what, name, obj, options, lines):
         r"\1See :doc:`/options`.\n",
         "\n".join(lines),
     )
-    lines[:] = text.split("\n")
+    # Napoleon takes the words before the first colon for the type of an attribute: here are none.
+    lines[:] = f"{': ' * (what == 'attribute')}{text}".split("\n")
 
 
 def _list_sections(app, pagename, templatename, context, doctree):

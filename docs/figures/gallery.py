@@ -356,7 +356,7 @@ def returns(axes: Axes) -> None:
         axes.text(mean + 2, -row, f"{mean:.0f}", color=colour, fontsize=20, va="center")
         axes.text(-2, -row, label, color=colour, fontsize=20, va="center", ha="right")
     axes.set_title("return of the team", fontsize=20, color=INK)
-    axes.set(xlim=(0, 100))
+    axes.set(xlim=(-36, 100))
     axes.axis("off")
 
 
@@ -398,6 +398,7 @@ def main() -> None:
     """Save the pictures."""
     for name in sys.argv[1:] or PICTURES:
         figure = new_figure(6.4, 3.2)
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.1)
         axes = figure.add_subplot()
         if name not in RESULT:
             axes.axis("off")

@@ -5,8 +5,11 @@ import sys
 from pathlib import Path
 
 from docutils import nodes
+from sphinx import addnodes
+from sphinx.transforms.post_transforms import SphinxPostTransform
+from sphinx.util.nodes import make_refnode
 
-from simenv_marl import __version__
+from simenv_marl import ROOMS, __version__
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
@@ -16,7 +19,7 @@ project = "simenv_marl"
 release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
-extensions += ["sphinx_copybutton", "sphinx_design"]
+extensions += ["sphinx.ext.viewcode", "sphinx_copybutton", "sphinx_design"]
 exclude_patterns = ["_build", "figures", "_clients_*"]  # figures and clients are parts of pages
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
@@ -34,6 +37,7 @@ copybutton_prompt_text = r">>> |\.\.\. |\$ "  # copied is what is typed, without
 copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
+pygments_dark_style = "a11y-dark"  # the partner of furo's light style; it underlines no names
 html_title = f"simenv_marl {release}"
 html_static_path = ["_static"]
 html_extra_path = ["_moved"]  # pages at old addresses, which lead to the new ones
@@ -42,6 +46,9 @@ html_js_files = ["sidebar.js"]
 html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"top_of_page_buttons": []}
+
+MOST_SECTIONS_UNLISTED = 3
+COLUMNS = {"difference", "first"}  # of tables of experiments, and also names of functions
 
 
 def _trim(app, doctree):
@@ -84,12 +91,51 @@ def _label(app, doctree):
 def _enlarge(app, doctree):
     """Load figures when they come into view.
 
-    A click shows one in its own size; the pictures of cards link to pages.
+    A click shows one in its own size, because Sphinx links pictures that have a width. pages.css
+    shows none larger than that. The pictures of cards link to pages.
     """
     for image in doctree.findall(nodes.image):
         image["loading"] = "lazy"
         if "sd-card-img-top" not in image["classes"]:
             image["width"] = "100%"
+
+
+class LinkNames(SphinxPostTransform):
+    """Link code in prose that is the name of a public object, or of a member of one."""
+
+    default_priority = 900  # after references, whose text may be code
+
+    def run(self, **kwargs):
+        """Replace each such text by a link to the entry of the object."""
+        entries = _entries_by_name(self.env.domains.python_domain.objects)
+        for code in list(self.document.findall(nodes.literal)):
+            entry = entries.get(code.astext().removesuffix("()"))
+            is_column = code.astext() in COLUMNS and self.env.docname == "reference/experiments"
+            if entry and not is_column and not _is_linked(code, entry.node_id):
+                place = (self.env.docname, entry.docname, entry.node_id)
+                code.replace_self(make_refnode(self.app.builder, *place, code.deepcopy()))
+
+
+def _entries_by_name(objects):
+    """Return the entries of objects, by the names that prose has for them."""
+    found = {}
+    for name, entry in objects.items():
+        if entry.aliased or not name.startswith("simenv_marl."):
+            continue
+        short = name.removeprefix("simenv_marl.")
+        room, _, rest = short.partition(".")
+        found |= dict.fromkeys({name, short, rest if room in ROOMS else short}, entry)
+    return found
+
+
+def _is_linked(node, node_id):
+    """Whether a node is in a link, in a heading, or in the entry itself."""
+    while node := node.parent:
+        if isinstance(node, (nodes.reference, nodes.title, addnodes.desc_signature)):
+            return True
+        if isinstance(node, addnodes.desc) and node_id in node[0]["ids"]:
+            return True
+    return False
 
 
 def _shorten(app, what, name, obj, options, lines):
@@ -99,13 +145,26 @@ def _shorten(app, what, name, obj, options, lines):
         r"\1See :doc:`/options`.\n",
         "\n".join(lines),
     )
-    lines[:] = text.split("\n")
+    # Napoleon takes the words before the first colon for the type of an attribute: here are none.
+    lines[:] = f"{': ' * (what == 'attribute')}{text}".split("\n")
+
+
+def _list_sections(app, pagename, templatename, context, doctree):
+    """List the sections of a long page at its top, for screens without room beside the text."""
+    toc = context.get("toc", "")
+    sections = toc.count("<li>") - toc.count("><code")  # without the names in the reference
+    shown = doctree is not None and "hide-toc" not in context["meta"]
+    if shown and sections > MOST_SECTIONS_UNLISTED:
+        listed = f'<details class="sections" open><summary>On this page</summary>{toc}</details>'
+        context["body"] = context["body"].replace("</h1>", f"</h1>\n{listed}", 1)
 
 
 def setup(app):
     """Called by Sphinx."""
+    app.add_post_transform(LinkNames)
     app.connect("builder-inited", lambda app: write_notebooks(DOCS))
     app.connect("doctree-read", _trim)
     app.connect("doctree-read", _label)
     app.connect("doctree-read", _enlarge)
+    app.connect("html-page-context", _list_sections)
     app.connect("autodoc-process-docstring", _shorten, priority=400)  # before napoleon

@@ -297,9 +297,9 @@ class Range:
     """The range of one number over all episodes."""
 
     name: str  #: "reward", or a component of an observation, as in "position[0]".
-    minimum: float
-    mean: float
-    maximum: float
+    minimum: float  #: The lowest number.
+    mean: float  #: The mean over all decisions.
+    maximum: float  #: The highest number.
 
     def __str__(self) -> str:
         return f"{self.name}: {self.minimum:.4g} to {self.maximum:.4g}, mean {self.mean:.4g}"

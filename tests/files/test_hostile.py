@@ -10,7 +10,7 @@ import pytest
 from simenv_marl import load_episode, save_episode
 from simenv_marl.errors import EpisodeFileError, SimEnvError
 from simenv_marl.files.names import find, names_of
-from tests.files.test_episodes import begun, changed, lines_of
+from tests.files.test_episodes import changed, lines_of
 from tests.worlds import saved
 
 HERE = __name__
@@ -86,7 +86,7 @@ def test_episode_file_with_a_name_of_another_object_is_refused(name, problem):
 
 @pytest.fixture
 def path(tmp_path):
-    save_episode(begun(), tmp_path / "a")
+    save_episode(saved.mid_episode(), tmp_path / "a")
     return tmp_path / "a"
 
 

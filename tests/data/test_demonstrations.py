@@ -258,7 +258,7 @@ def test_compare_with_rule_compares_actions_of_all_spaces():
     assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
 
 
-def test_compare_with_rule_takes_several_policies_even_if_one_never_decides():
+def test_compare_with_rule_takes_policies_even_if_one_never_decides():
     ant, bee = (
         decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0")
     )

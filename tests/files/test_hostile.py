@@ -12,7 +12,6 @@ from simenv_marl.errors import EpisodeFileError, SimEnvError
 from simenv_marl.files.names import find, names_of
 from tests.files.test_episodes import changed, lines_of
 from tests.worlds import saved
-from tests.worlds.saved import mid_episode
 
 HERE = __name__
 touched = []
@@ -87,7 +86,7 @@ def test_episode_file_with_a_name_of_another_object_is_refused(name, problem):
 
 @pytest.fixture
 def path(tmp_path):
-    save_episode(mid_episode(), tmp_path / "a")
+    save_episode(saved.mid_episode(), tmp_path / "a")
     return tmp_path / "a"
 
 

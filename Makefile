@@ -136,14 +136,15 @@ test-negotiation:
 
 # The oldest supported versions of all dependencies, with the tests of the order of events.
 OLDEST_TESTS := $(addprefix tests/contract/test_,$(addsuffix .py,conformance ends environments episodes errors goals_and_time identity \
-	joint many_agents rounds side_by_side simulate simulate_many)) \
-	tests/core/test_drivers.py tests/envs/test_vector.py tests/many/test_workers.py tests/test_definitions.py
+	joint many_agents mesa rounds side_by_side simulate simulate_many)) \
+	tests/core/test_drivers.py tests/envs/test_vector.py tests/examples/test_mesa_models.py \
+	tests/many/test_workers.py tests/test_definitions.py
 test-oldest: .venv-oldest/.oldest
 	.venv-oldest/bin/python -m pytest --driver greenlet $(OLDEST_TESTS)
 
 .venv-oldest/.oldest: pyproject.toml tests/oldest.txt
 	test -x $(@D)/bin/python || $(OLDEST_PYTHON) -m venv $(@D)
-	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis pytest simpy
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis 'mesa[network]' pytest simpy
 	touch $@
 
 # What is published. The wheel is tested with what the source distribution contains, but for the sources: nothing can stand

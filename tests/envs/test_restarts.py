@@ -21,7 +21,7 @@ from simenv_marl import vector_env
 from simenv_marl.errors import OptionValueError, WorkerError
 from simenv_marl.many import restarts
 from tests.processes import alone, descriptors
-from tests.worlds.models import DRIVERS
+from tests.worlds.models import BY_DRIVER
 from tests.worlds.vectors import (
     FORK,
     FORKS,
@@ -277,7 +277,7 @@ def loop_in_c():
 
 
 @pytest.mark.parametrize(("hang", "why"), [(loop, "in loop\n"), (loop_in_c, "exit code 1")])
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_vector_env_replaces_a_worker_that_takes_too_long_for_a_step(
     hang, why, driver, monkeypatch
 ):

@@ -387,14 +387,7 @@ class AnnouncingLife(Life):
         return [(self.beings[number],) for number in self.announced or ()]
 
 
-def life(
-    program,
-    *,
-    announced=None,
-    timed=False,
-    ends=None,
-    kind=Being,
-):
+def life(program, *, announced=None, timed=False, ends=None, kind=Being):
     """A factory of lives, as ``life("0 acts, 0 health 5, 0 leaves, 1 acts")``."""
     base = Life if announced is None else AnnouncingLife
     if timed:

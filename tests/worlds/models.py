@@ -239,6 +239,8 @@ EVERY_VIEW = pytest.mark.parametrize("view", VIEWS)
 DRIVERS = ("greenlet", "thread")
 EVERY_DRIVER = pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
 """Environments are made with that driver, unless they are told otherwise."""
+BY_DRIVER = pytest.mark.parametrize("driver", DRIVERS)
+"""The test gets the name of the driver."""
 
 
 MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")

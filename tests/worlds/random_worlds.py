@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, TRUNCATED, difference, make_step
 from tests.worlds.models import define
 
+HERE = __name__
 KINDS = (
     "method",
     "function",
@@ -314,7 +315,6 @@ class Reference(World):
         return action + self.random.randrange(3) if kind == "apply" else action
 
 
-HERE = __name__
 MOST_MACHINES = 6
 YARD_ROSTER = {
     f"{HERE}.Machine.{name}": [f"{name}_{number}" for number in range(MOST_MACHINES)]
@@ -347,8 +347,6 @@ yard_designs = st.builds(
     luck=st.integers(2, 6),
     until=st.none() | st.integers(3, 15),
 )
-
-seeds = st.integers(0, 2**31 - 1)
 
 
 class Machine:
@@ -493,7 +491,6 @@ def yard_outcome(yard):
     return yard.trace, yard.fortune, yard.built, yard.clock.now, yard.random.getstate()
 
 
-HERE = __name__
 MOST_STALLS = 6
 
 

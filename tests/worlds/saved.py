@@ -47,13 +47,13 @@ from tests.worlds.random_worlds import (
     KINDS,
     YARD_POINTS,
     World,
+    WorldDesign,
     Yard,
     YardDesign,
     points_of,
     world_policies,
     yard_outcome,
 )
-from tests.worlds.random_worlds import WorldDesign as Program
 
 HERE = __name__
 
@@ -243,7 +243,7 @@ def program(seed):
     """Return the arguments of a random program, whose functions have no names."""
     chance = random.Random(seed)
     number = chance.randint(1, 4)
-    design = Program(
+    design = WorldDesign(
         tuple(chance.choices(KINDS, k=number)),
         ((0, 1), *((chance.randrange(number), chance.randrange(3)) for _ in range(14))),
         policies=frozenset({1} if number > 2 else ()),
@@ -491,13 +491,7 @@ def tree_of_yard(chance):
     )
 
 
-def of_tree(
-    chance,
-    env,
-    step,
-    come,
-    methods,
-):
+def of_tree(chance, env, step, come, methods):
     """Whether an environment's clones, their clones and all branches have its outcome.
 
     All move in a random order. A ``step`` returns what is told, and whether it was the last one.

@@ -387,7 +387,7 @@ class Archive:
                 "".join(f"{line} " * 3 + "\n" for line in range(3000))
             )
             try:
-                # what is found by its name is every branch's alike
+                # opened by name here only, because all branches share the named files
                 for _ in range(self.chance.randrange(6)):
                     self.open()
                 self.numbers.append(os.open(Path(self.folder, "0"), os.O_RDWR))
@@ -528,7 +528,7 @@ def of_tree(chance, env, step, come, methods):
 
 
 def differing_branches(number, seed=0):
-    """How many of at least so many branches and clones differ, and of how many."""
+    """Return how many branches and clones differ, and how many there are: at least ``number``."""
     chance, alike = random.Random(seed), []
     while len(alike) < number:
         alike += chance.choice([tree_of_archive, tree_of_yard])(chance)

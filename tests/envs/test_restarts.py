@@ -35,6 +35,7 @@ from tests.worlds.vectors import (
 )
 
 pytestmark = [
+    pytest.mark.usefixtures("no_workers_left"),
     FORKS,
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL"),
 ]
@@ -110,14 +111,6 @@ def own(step, places):
     """The observations, rewards and flags of some simulations."""
     observations, _, *columns = step
     return [observations[places], *(column[places] for column in columns)]
-
-
-@pytest.fixture(autouse=True)
-def _nothing_is_left():
-    before = set(multiprocessing.active_children())
-    yield
-    gc.collect()
-    assert set(multiprocessing.active_children()) <= before
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -46,10 +46,10 @@ test-studies: .venv/.test .venv-bounds/.bounds
 	$(BIN)/python -m pytest -n 2 $(STUDIES)
 	.venv-bounds/bin/python -m pytest tests/studies/test_bounds.py
 
-# All tests that there are. Run it before a release: it takes more than an hour on two cores.
+# All tests. Run it before a release: it takes more than an hour on two cores.
 test-all: test test-thorough test-studies test-wheel test-oldest test-templates test-pythons test-language test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
-# The quickest of them, for each commit: about a minute on two cores, once the environment is there.
+# The quickest tests, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
 	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
 	one_agent rounds simulate)) \
@@ -57,7 +57,7 @@ CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_r
 check: lint
 	$(BIN)/python -m pytest --quiet -n 2 $(CHECK_TESTS)
 
-# The same for the pension fund. PENSION="--quick --out /tmp/pension"
+# Experiments with the pension fund. Runs only what is missing. PENSION="--quick --out /tmp/pension"
 pension: .venv/.matrix
 	$(BIN)/python -m studies.pension.study $(PENSION)
 

@@ -145,8 +145,13 @@ def _shorten(app, what, name, obj, options, lines):
         r"\1See :doc:`/options`.\n",
         "\n".join(lines),
     )
-    # Napoleon takes the words before the first colon for the type of an attribute: here are none.
-    lines[:] = f"{': ' * (what == 'attribute')}{text}".split("\n")
+    lines[:] = text.split("\n")
+
+
+def _keep_colons(app, what, name, obj, options, lines):
+    """Keep the first words of an attribute's text, which napoleon takes for its type at a colon."""
+    if what == "attribute" and lines:
+        lines[0] = f": {lines[0]}"
 
 
 def _list_sections(app, pagename, templatename, context, doctree):
@@ -168,3 +173,4 @@ def setup(app):
     app.connect("doctree-read", _enlarge)
     app.connect("html-page-context", _list_sections)
     app.connect("autodoc-process-docstring", _shorten, priority=400)  # before napoleon
+    app.connect("autodoc-process-docstring", _keep_colons, priority=400)  # the same

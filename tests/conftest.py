@@ -70,18 +70,19 @@ def pytest_report_header(config):
     )
 
 
+def is_in_extent(item, extent):
+    """Whether a run of that extent has a test; both extents have the tests with random examples."""
+    is_thorough = item.get_closest_marker("thorough") is not None
+    if extent == "quick":
+        return not is_thorough
+    return is_thorough or is_hypothesis_test(getattr(item, "obj", None))
+
+
 def pytest_collection_modifyitems(config, items):
     if config.option.extent != "all":
-        parts = {"quick": [], "thorough": []}
-        for item in items:
-            is_property = is_hypothesis_test(getattr(item, "obj", None))
-            if is_property or item.get_closest_marker("thorough"):
-                parts["thorough"].append(item)
-            if not item.get_closest_marker("thorough"):
-                parts["quick"].append(item)
-        kept = parts[config.option.extent]
-        config.hook.pytest_deselected(items=[item for item in items if item not in set(kept)])
-        items[:] = kept
+        left_out = [item for item in items if not is_in_extent(item, config.option.extent)]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if is_in_extent(item, config.option.extent)]
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
         places = {

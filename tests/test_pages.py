@@ -234,10 +234,10 @@ def test_readme_code_gives_the_rewards_that_it_shows():
 def test_readme_pictures_and_links_lead_to_files():
     """No badge stands for a service that does not exist."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)|<img src=\"([^\"]*)\"", text)
     links = [link for link in re.findall(r"\]\(([^)]*)\)", text) if not link.startswith("https://")]
-    assert pictures
-    assert [path for path in (*pictures, *links) if not (ROOT / path).is_file()] == []
+    assert len(pictures) == text.count("![") + text.count("<img") > 0
+    assert [path for path in (*map("".join, pictures), *links) if not (ROOT / path).is_file()] == []
 
 
 def told_in_an_episode(env, seed):

@@ -54,8 +54,8 @@ import java.util.function.Supplier;
  * the standard streams. Without that variable, the rule makes every decision; the overhead is one test, and the
  * arguments are not collected.
  *
- * <p>Any thread of the model may ask for decisions, one at a time. Such threads have to end with their episode, also where
- * it is stopped; those of the common pool (parallel streams) are waited for then.
+ * <p>Any thread of the model may ask for decisions, one at a time. Such threads have to end with their episode. If it is
+ * stopped or fails, this class waits some seconds for the common pool (parallel streams), but for no other threads.
  */
 public final class SimEnv {
     private static final int VERSION = 1;
@@ -223,7 +223,7 @@ public final class SimEnv {
             result = episode.run(seeded, options(start.get("options")));
         } catch (Throwable thrown) {
             error = thrown;
-            // a parallel stream that fails in one thread does not wait for its others, which would ask in the next episode
+            // because a parallel stream that fails in one thread leaves others, which would ask in the next episode
             ForkJoinPool.commonPool().awaitQuiescence(SECONDS_TO_LEAVE, TimeUnit.SECONDS);
         }
         finish(result, error);

@@ -23,9 +23,8 @@ from simenv_marl import simulate
 HERE = Path(__file__).parent
 DEMO = HERE.parents[1] / "examples/greenhouse_coop/out/greenhouse.json"
 
-GREY, ORANGE, BLUE, GREEN, RED, INK = (
-    *("#8c8c8c", "#d1812c", "#2f7fb5", "#1b6f5f", "#b5443a", "#333333"),
-)
+GREY, ORANGE, BLUE = "#8c8c8c", "#d1812c", "#2f7fb5"
+GREEN, RED, INK = "#1b6f5f", "#b5443a", "#333333"
 PALE, SILVER, SAND = "#e8ecef", "#c5ccd1", "#f3d9bd"
 BOLD: dict[str, Any] = {"weight": "bold", "fontsize": 24}
 MIDDLE: dict[str, Any] = {"weight": "bold", "ha": "center", "va": "center"}
@@ -84,11 +83,9 @@ def rabbits(axes: Axes) -> None:
 
 def greenhouse(axes: Axes) -> None:
     """Draw the living plants of the demo, by the rule and by its trained agents."""
-    alive = json.loads(DEMO.read_text(encoding="utf-8"))["alive"]
-    for title, label, colour in (("both trained", "trained", GREEN), ("rule", "rule", GREY)):
-        means = np.mean(alive[title], axis=0)
-        axes.plot(means, color=colour, linewidth=7)
-        place = (34, 135) if colour == GREEN else (14, 40)
+    for title, place in (("both trained", (34, 135)), ("rule", (14, 40))):
+        label, colour = TEAMS[title]
+        axes.plot(np.mean(of_demo("alive")[title], axis=0), color=colour, linewidth=7)
         axes.text(*place, label, color=colour, fontsize=26, weight="bold")
     axes.axhline(0, color=INK, linewidth=2)
     axes.set(ylim=(-12, 225), xlim=(-2, 100))
@@ -347,9 +344,14 @@ TEAMS = {
 """Teams of the demo, with the label and the colour of each."""
 
 
+def of_demo(name: str) -> Any:
+    """Return results of the demo: the returns, or the plants alive, of each team."""
+    return json.loads(DEMO.read_text(encoding="utf-8"))[name]
+
+
 def returns(axes: Axes) -> None:
     """Draw the mean return of each team."""
-    values = json.loads(DEMO.read_text(encoding="utf-8"))["returns"]
+    values = of_demo("returns")
     for row, (title, (label, colour)) in enumerate(TEAMS.items()):
         mean = np.mean(values[title])
         axes.barh(-row, mean, 0.7, color=colour)
@@ -362,7 +364,7 @@ def returns(axes: Axes) -> None:
 
 def plants(axes: Axes) -> None:
     """Draw the plants alive on each day."""
-    alive = json.loads(DEMO.read_text(encoding="utf-8"))["alive"]
+    alive = of_demo("alive")
     for title, (_, colour) in TEAMS.items():
         axes.plot(np.mean(alive[title], axis=0), color=colour, linewidth=5)
     axes.set_title("plants alive, of 200", fontsize=20, color=INK)

@@ -47,10 +47,6 @@ def seen(mapping, point=TANK, **changes):
     return calls[0]
 
 
-def call_of(tank, level):
-    return tank, level
-
-
 @pytest.mark.parametrize(
     ("mapping", "expected"),
     [

@@ -29,7 +29,7 @@ from tests.worlds.entities import (
     colony_policy,
     seeds,
 )
-from tests.worlds.models import DRIVERS, calling, decision, fails, notes, script
+from tests.worlds.models import BY_DRIVER, calling, decision, fails, notes, script
 from tests.worlds.valued import LEFT, Duel, points
 
 
@@ -192,7 +192,7 @@ def test_simulate_keeps_no_entity_alive_after_its_decision(action):
     assert env.simulation.log == [True] * 3
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_simulate_passes_policies_the_simulation_of_their_own_episode(driver):
     asked = []
 

@@ -20,6 +20,7 @@ from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.processes import run_code
 from tests.worlds.models import (
+    BY_DRIVER,
     EVERY_DRIVER,
     Script,
     begun,
@@ -31,7 +32,6 @@ from tests.worlds.models import (
     script,
 )
 
-DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 REFUSED = "choose was called in a thread that the simulation has started"
 
 
@@ -346,7 +346,7 @@ def test_forked_process_of_a_model_in_a_thread_prints_uncaught_errors():
 
 
 @pytest.mark.thorough
-@DRIVERS
+@BY_DRIVER
 @pytest.mark.parametrize(
     "where", ["suspended", "closed", "inside", "in a thread", "in daemons", "moving"]
 )
@@ -394,7 +394,7 @@ def test_python_exits_cleanly_with_envs_in_mid_episode(driver, where):
         assert said == "unwound\n" * {"inside": 4, "moving": 1}.get(where, 2)
 
 
-@DRIVERS
+@BY_DRIVER
 @pytest.mark.parametrize(("end", "status"), [("sys.exit(3)", 3), ("os._exit(4)", 4)])
 def test_model_can_end_the_python_process(driver, end, status):
     said = run(

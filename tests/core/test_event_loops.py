@@ -11,9 +11,7 @@ import pytest
 
 from simenv_marl import SimulationInterface, single_env
 from simenv_marl.errors import SimulationError
-from tests.worlds.models import DRIVERS, EVERY_DRIVER, begun, decision, script
-
-DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
+from tests.worlds.models import BY_DRIVER, EVERY_DRIVER, begun, decision, script
 
 
 def around():
@@ -90,7 +88,7 @@ def check_tracked(env, outside):
 NOTHING = (None, (None, None), 0)
 
 
-@DRIVERS
+@BY_DRIVER
 def test_env_of_an_asyncio_model_keeps_the_users_async_generator_hooks(driver):
     def hook(generator):
         """What takes note of asynchronous generators."""
@@ -165,7 +163,7 @@ def deciding(driver, interrupted=False):
     return begun(single_env(script(main), decide, driver=driver))
 
 
-@DRIVERS
+@BY_DRIVER
 def test_keyboard_interrupt_between_steps_reaches_the_users_signal_handler(driver):
     caught = []
 

@@ -5,11 +5,9 @@ import sys
 import pytest
 
 from tests.processes import run_code
-from tests.worlds.models import DRIVERS
+from tests.worlds.models import BY_DRIVER
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform does not fork")
-
-DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
 PREAMBLE = """
     import multiprocessing, os, signal, warnings
@@ -69,7 +67,7 @@ def run(code, driver):
     )
 
 
-@DRIVERS
+@BY_DRIVER
 def test_process_pool_that_a_model_forks_in_run_cannot_decide(driver):
     run(
         """
@@ -80,7 +78,7 @@ def test_process_pool_that_a_model_forks_in_run_cannot_decide(driver):
     )
 
 
-@DRIVERS
+@BY_DRIVER
 def test_process_pool_forked_before_run_follows_the_models_rule(driver):
     run(
         """
@@ -96,7 +94,7 @@ def test_process_pool_forked_before_run_follows_the_models_rule(driver):
     )
 
 
-@DRIVERS
+@BY_DRIVER
 def test_forked_worker_process_can_use_environments_of_its_own(driver):
     run(
         """

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.processes import run_code
+from tests.worlds.models import BY_DRIVER
 
 pytest.importorskip("gevent")
 
@@ -50,7 +51,7 @@ RULED = """
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@BY_DRIVER
 @pytest.mark.parametrize("first", ["user", "model"])
 @pytest.mark.parametrize("where", ["main", "spawned"])
 def test_gevent_decision_in_the_users_greenlets_follows_the_models_rule(where, first, driver):
@@ -182,7 +183,7 @@ PATCHED = """
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@BY_DRIVER
 def test_thread_driver_refuses_threads_that_gevent_has_patched(driver):
     told = run_code(f"driver = {driver!r}", PATCHED.format(""))
     assert "patch_all(thread=False, queue=False)" in told

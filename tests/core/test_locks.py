@@ -14,9 +14,8 @@ from simenv_marl.core.switching import threads
 from simenv_marl.errors import SimulationError
 from simenv_marl.hooks import locks
 from simenv_marl.hooks.stacks import STACKS
-from tests.worlds.models import define
+from tests.worlds.models import BY_DRIVER, define
 
-DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 TASKS = "/proc/self/task"
 LISTED = os.path.exists(TASKS)
 NOT_LISTED = "the system does not list threads"
@@ -100,7 +99,7 @@ def begin(model, driver, envs):
 # -- told -----------------------------------------------------------------------------------------
 
 
-@DRIVERS
+@BY_DRIVER
 @pytest.mark.parametrize(
     ("holder", "waiter"),
     [
@@ -130,7 +129,7 @@ def test_env_raises_an_error_if_a_model_waits_for_another_models_lock(driver, ho
         second.close()
 
 
-@DRIVERS
+@BY_DRIVER
 def test_env_reports_on_stderr_a_lock_wait_in_another_thread(driver, capfd):
     def use():
         first.reset()
@@ -204,7 +203,7 @@ class Leaves(Sleeps):
             self.decide()
 
 
-@DRIVERS
+@BY_DRIVER
 @pytest.mark.parametrize("model", [Sleeps, Lends, Leaves])
 def test_env_does_not_report_a_short_wait_for_a_lock(driver, model, capfd):
     first = env_of(Leaves if model is Leaves else Lends if model is Lends else Model, driver)

@@ -15,6 +15,7 @@ from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
 from tests.processes import python
 from tests.worlds.copied import Walk, WalkEnv, blow, define_walk
+from tests.worlds.models import BY_DRIVER
 
 VIEWS = {
     make.__name__: partial(make, Walk, Walk.choose)
@@ -109,7 +110,7 @@ def test_copied_env_needs_a_reset_if_copied_in_mid_episode(make, copied):
     assert episode(copied(env), seed=3) == episode(make(), seed=3)
 
 
-@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@BY_DRIVER
 @COPIES
 def test_copied_env_has_all_options(copied, driver):
     """Undecorated points, policies, plugins, variants, rosters and all other options."""

@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, aec_env, parallel_env, single_env
@@ -41,7 +41,6 @@ def is_blank(env, agent, observation):
     return env.observation_space(agent).contains(observation) and not np.any(observation)
 
 
-@settings(deadline=None)
 @given(EVERYBODY)
 def test_pad_agents_of_aec_env_selects_live_agents_only(world):
     def look(agent):
@@ -66,7 +65,6 @@ def test_pad_agents_of_aec_env_selects_live_agents_only(world):
     assert ends == dict.fromkeys(everybody, (not design.truncates, design.truncates))
 
 
-@settings(deadline=None)
 @given(EVERYBODY)
 def test_pad_agents_of_parallel_env_adds_all_agents_to_its_results(world):
     design, seed, kind = world

@@ -21,7 +21,7 @@ from simenv_marl import vector_env
 from simenv_marl.errors import OptionValueError, WorkerError
 from simenv_marl.many import restarts
 from tests.processes import alone, descriptors
-from tests.worlds.models import DRIVERS
+from tests.worlds.models import BY_DRIVER
 from tests.worlds.vectors import (
     FORK,
     FORKS,
@@ -35,6 +35,7 @@ from tests.worlds.vectors import (
 )
 
 pytestmark = [
+    pytest.mark.usefixtures("no_workers_left"),
     FORKS,
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL"),
 ]
@@ -110,14 +111,6 @@ def own(step, places):
     """The observations, rewards and flags of some simulations."""
     observations, _, *columns = step
     return [observations[places], *(column[places] for column in columns)]
-
-
-@pytest.fixture(autouse=True)
-def _nothing_is_left():
-    before = set(multiprocessing.active_children())
-    yield
-    gc.collect()
-    assert set(multiprocessing.active_children()) <= before
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -277,7 +270,7 @@ def loop_in_c():
 
 
 @pytest.mark.parametrize(("hang", "why"), [(loop, "in loop\n"), (loop_in_c, "exit code 1")])
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_vector_env_replaces_a_worker_that_takes_too_long_for_a_step(
     hang, why, driver, monkeypatch
 ):

@@ -20,20 +20,12 @@ from tests.processes import alone, descriptors, gone, python
 from tests.worlds.models import DRIVERS, fails, notes
 from tests.worlds.vectors import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 
-pytestmark = FORKS
+pytestmark = [FORKS, pytest.mark.usefixtures("no_workers_left")]
 
 
 def workers(model=Counter, decision=None, **options):
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
     return vector_env(model, {POINT: decision or definition()}, **options)
-
-
-@pytest.fixture(autouse=True)
-def _nothing_is_left():
-    before = set(multiprocessing.active_children())  # joblib keeps its own for the next time
-    yield
-    gc.collect()
-    assert set(multiprocessing.active_children()) <= before
 
 
 class Failing(Counter):

@@ -19,7 +19,7 @@ from simenv_marl.experiments import Variant, decision_values, ledger, ledgers
 from simenv_marl.planning import RolloutPolicy
 from simenv_marl.seats import describe
 from tests.extent import examples
-from tests.worlds.models import Script, define
+from tests.worlds.models import BY_DRIVER, Script, define
 from tests.worlds.random_worlds import FAIR_POINTS, FAIR_POLICIES, Fair, boldest, fair_policy
 
 COLUMNS = [
@@ -157,7 +157,7 @@ def test_ledger_can_use_a_metric_or_team_reward_in_place_of_rewards():
         ledger(Fair, FAIR_POLICIES, seeds=[1], points=FAIR_POINTS, metric=lambda fair: "high")
 
 
-@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@BY_DRIVER
 def test_ledger_futures_use_copies_of_the_global_generators(driver):
     class Thrown(Dice):
         reseed = None

@@ -46,7 +46,7 @@ from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.players import player_of
 from simenv_marl.planning.rollouts import Rollouts
 from tests.test_branch import METHODS
-from tests.worlds.models import DRIVERS, define
+from tests.worlds.models import BY_DRIVER, define
 from tests.worlds.valued import LEFT, Duel, Unseeded, points, worth
 
 VIEWS = ("aec", "parallel", "single", "agent")
@@ -97,7 +97,7 @@ class Limited(Duel):
 
 @pytest.mark.thorough
 @METHODS
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 @pytest.mark.parametrize("view", VIEWS)
 def test_action_values_are_the_same_in_every_env_and_driver(view, driver, method):
     if driver == "thread" and method == "fork":

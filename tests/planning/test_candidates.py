@@ -22,7 +22,7 @@ from simenv_marl.errors import InvalidActionError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, first
 from tests.planning.test_action_values import begun
 from tests.test_branch import METHODS
-from tests.worlds.models import DRIVERS, define
+from tests.worlds.models import BY_DRIVER, define
 
 
 class Works:
@@ -125,7 +125,7 @@ def test_action_values_with_terminal_value_count_the_last_interval_in_full():
 
 
 @METHODS
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_action_values_metric_replaces_rewards(driver, method):
     if driver == "thread" and method == "fork":
         method = None
@@ -307,7 +307,7 @@ def patient(**given):
     return RolloutPolicy([short, long], futures=2, metric=lambda works: -len(works.log), **given)
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_rollout_policy_every_repeats_its_choice_between_plans(driver):
     planned = []
 

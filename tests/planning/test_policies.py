@@ -31,7 +31,7 @@ from simenv_marl.errors import ClosedError, CopyError, OptionValueError, Reentra
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
 from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
 from tests.test_branch import METHODS
-from tests.worlds.models import DRIVERS, define, step
+from tests.worlds.models import BY_DRIVER, define, step
 from tests.worlds.valued import LEFT, Duel, Unseeded, points, worth
 
 
@@ -124,7 +124,7 @@ def test_rollout_policy_tries_actions_of_a_round_in_the_same_futures(wide):
 @pytest.mark.thorough
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
-@pytest.mark.parametrize("driver", DRIVERS)
+@BY_DRIVER
 def test_planning_policies_in_simulate_choose_the_actions_of_a_reference(driver, key, method):
     policy = planner(method=None if driver == "thread" and method == "fork" else method)
     found = simulate(Duel, {key: policy}, points=tame(), seed=5, driver=driver)

@@ -46,7 +46,7 @@ class Other:
 
 
 def banish(place, being):
-    """Ends a being that is not what it is called on."""
+    """End a being by a function whose first argument is another object."""
     being.whole = False
 
 
@@ -61,13 +61,13 @@ def other_of(other):
 
 
 def watch(being):
-    """A being's health; that of one that is not whole any more is not to be seen."""
+    """Observe the number and the health of a being; fail if it has left."""
     assert being.whole, "observed after its end"
     return [being.number, being.health]
 
 
 def pay(being):
-    """A being's reward is its health."""
+    """Reward a being by its health; fail if it has left."""
     assert being.whole, "rewarded after its end"
     return being.health
 
@@ -260,7 +260,7 @@ class AnsweredColony(Colony):
 
     @property
     def totals(self):
-        """What everybody who has decided was paid, where the change of the fortune is paid."""
+        """The return of each agent that has decided: the change of the fortune in its life."""
         return {agent: float(self.last[agent] - self.first[agent]) for agent in self.first}
 
 
@@ -341,7 +341,7 @@ def play_colony(env, seed, look=lambda agent: None):
 
 
 class Life(SimulationInterface):
-    """A simulation of ten beings; ``now`` is told as its time where it is timed."""
+    """A simulation of ten beings, whose time is ``now`` if it is timed."""
 
     def __init__(self, program, announced, ends, kind):
         self.program, self.announced, self.ends, self.kind = program, announced, ends, kind
@@ -361,7 +361,7 @@ class Life(SimulationInterface):
         return self.ends
 
     def happens(self, number, what, *value):
-        """Let one thing happen to a being; whatever else it is is set."""
+        """Do one thing to a being; any other word is an attribute, which gets the value."""
         if what == "acts":
             self.log.append(self.beings[number].act())
         elif what == "leaves":
@@ -380,21 +380,14 @@ class Life(SimulationInterface):
 
 
 class AnnouncingLife(Life):
-    """One that knows who is going to decide."""
+    """A life that announces decisions."""
 
     def expected_calls(self, point):
         self.asked.append(point)
         return [(self.beings[number],) for number in self.announced or ()]
 
 
-def life(
-    program,
-    *,
-    announced=None,
-    timed=False,
-    ends=None,
-    kind=Being,
-):
+def life(program, *, announced=None, timed=False, ends=None, kind=Being):
     """A factory of lives, as ``life("0 acts, 0 health 5, 0 leaves, 1 acts")``."""
     base = Life if announced is None else AnnouncingLife
     if timed:

@@ -239,6 +239,8 @@ EVERY_VIEW = pytest.mark.parametrize("view", VIEWS)
 DRIVERS = ("greenlet", "thread")
 EVERY_DRIVER = pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
 """Environments are made with that driver, unless they are told otherwise."""
+BY_DRIVER = pytest.mark.parametrize("driver", DRIVERS)
+"""The test gets the name of the driver."""
 
 
 MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
@@ -264,7 +266,7 @@ def registries_put_back():
 
 @contextmanager
 def models_of_pages_forgotten():
-    """Have the models of pages imported anew, and forget them afterwards.
+    """Import the models of pages anew in the block, and forget them afterwards.
 
     Names of decision points would find the decorated functions of an earlier import as long as
     these exist.
@@ -284,7 +286,7 @@ def _forget_models_of_pages():
 
 @contextmanager
 def left_as_they_were(*places):
-    """Make sure that classes and modules hold at the end just what they held."""
+    """Assert that the attributes of classes and modules are the same afterwards."""
     before = [held(place) for place in places]
     yield
     for place, then in zip(places, before, strict=True):
@@ -294,7 +296,7 @@ def left_as_they_were(*places):
 
 
 def held(place):
-    """What a class or module holds, but for what Python adds."""
+    """The attributes of a class or module, without those that Python adds."""
     return {
         name: value
         for name, value in vars(place).items()

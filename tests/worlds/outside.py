@@ -169,7 +169,7 @@ POINTS = ["reservoir.inflow", "broker.price"]
 
 
 def _grandchild(wire):
-    """Leave behind what holds the pipes, and go."""
+    """Exit, but leave a process that holds the pipes open."""
     subprocess.Popen(["sleep", "600"], pass_fds=(wire.writing, wire.lines.fileno()))
     os._exit(5)
 
@@ -202,11 +202,11 @@ FAULTS = {
         {"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}
     ),
 }
-"""What goes wrong in mid-episode, after three decisions."""
+"""Faults in mid-episode, after three decisions."""
 
 
 class Faulty:
-    """A model that does it."""
+    """A model that makes one of the faults."""
 
     wire: Any
     what: str
@@ -215,7 +215,7 @@ class Faulty:
         self.options = options
 
     def run(self, decide, *_):
-        """Decide three times, then do it."""
+        """Decide three times, then make the fault."""
         try:
             for _ in range(3):
                 decide(

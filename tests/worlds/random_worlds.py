@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, TRUNCATED, difference, make_step
 from tests.worlds.models import define
 
+HERE = __name__
 KINDS = (
     "method",
     "function",
@@ -91,19 +92,19 @@ There are enough of them.
 
 
 def agent_of(kind, point, entity):
-    """Who decides a call."""
+    """The name of the agent that decides a call."""
     if kind == "sometimes" and entity == 0:
         return None
     return f"point_{point}_{entity}" if kind in ("entity", "sometimes") else f"point_{point}"
 
 
 def watched(level, calls):
-    """What everybody observes."""
+    """The observation of every agent."""
     return [level, calls]
 
 
 def paid(level, point):
-    """What whoever decides at a point is paid."""
+    """The reward of an agent at a point."""
     return (level * (point + 2) % 23 - 9) / 8
 
 
@@ -123,7 +124,7 @@ def legal(answer, info):
 
 
 class Entity:
-    """What some of the points are decided for."""
+    """An entity of the model, for which some points decide."""
 
     def __init__(self, world, number):
         self.world, self.number = world, number
@@ -285,7 +286,7 @@ class Reference(World):
         return (self.level - before) / 4
 
     def call(self, point, entity):
-        """Who decides is told so, and does what was answered."""
+        """Note the turn of the agent that decides, and use its answer."""
         kind = self.design.kinds[point]
         agent = agent_of(kind, point, entity)
         if agent is None or point in self.design.rules:
@@ -314,7 +315,6 @@ class Reference(World):
         return action + self.random.randrange(3) if kind == "apply" else action
 
 
-HERE = __name__
 MOST_MACHINES = 6
 YARD_ROSTER = {
     f"{HERE}.Machine.{name}": [f"{name}_{number}" for number in range(MOST_MACHINES)]
@@ -347,8 +347,6 @@ yard_designs = st.builds(
     luck=st.integers(2, 6),
     until=st.none() | st.integers(3, 15),
 )
-
-seeds = st.integers(0, 2**31 - 1)
 
 
 class Machine:
@@ -493,7 +491,6 @@ def yard_outcome(yard):
     return yard.trace, yard.fortune, yard.built, yard.clock.now, yard.random.getstate()
 
 
-HERE = __name__
 MOST_STALLS = 6
 
 
@@ -557,7 +554,7 @@ class Fair:
 
 
 def affordable(stall, fair, *, _answers):
-    """The mask of prices: not those that two stalls of the day have already."""
+    """The mask of prices: at most two stalls a day have the same one."""
     return np.array([_answers.count(price) < 2 for price in range(4)], np.int8)
 
 

@@ -47,13 +47,13 @@ from tests.worlds.random_worlds import (
     KINDS,
     YARD_POINTS,
     World,
+    WorldDesign,
     Yard,
     YardDesign,
     points_of,
     world_policies,
     yard_outcome,
 )
-from tests.worlds.random_worlds import WorldDesign as Program
 
 HERE = __name__
 
@@ -243,7 +243,7 @@ def program(seed):
     """Return the arguments of a random program, whose functions have no names."""
     chance = random.Random(seed)
     number = chance.randint(1, 4)
-    design = Program(
+    design = WorldDesign(
         tuple(chance.choices(KINDS, k=number)),
         ((0, 1), *((chance.randrange(number), chance.randrange(3)) for _ in range(14))),
         policies=frozenset({1} if number > 2 else ()),
@@ -387,7 +387,7 @@ class Archive:
                 "".join(f"{line} " * 3 + "\n" for line in range(3000))
             )
             try:
-                # what is found by its name is every branch's alike
+                # opened by name here only, because all branches share the named files
                 for _ in range(self.chance.randrange(6)):
                     self.open()
                 self.numbers.append(os.open(Path(self.folder, "0"), os.O_RDWR))
@@ -491,13 +491,7 @@ def tree_of_yard(chance):
     )
 
 
-def of_tree(
-    chance,
-    env,
-    step,
-    come,
-    methods,
-):
+def of_tree(chance, env, step, come, methods):
     """Whether an environment's clones, their clones and all branches have its outcome.
 
     All move in a random order. A ``step`` returns what is told, and whether it was the last one.
@@ -534,7 +528,7 @@ def of_tree(
 
 
 def differing_branches(number, seed=0):
-    """How many of at least so many branches and clones differ, and of how many."""
+    """Return how many branches and clones differ, and how many there are: at least ``number``."""
     chance, alike = random.Random(seed), []
     while len(alike) < number:
         alike += chance.choice([tree_of_archive, tree_of_yard])(chance)

@@ -262,7 +262,7 @@ SEEN = {
         lambda dial: {"place": np.array([dial.place]), "turns": np.int64(dial.turns)},
     ),
 }
-"""What may be seen of a dial: in which space, and what."""
+"""Kinds of observations of a dial, each with its space and its mapping."""
 
 
 class DialSim:
@@ -322,7 +322,7 @@ class DialEnv(gymnasium.Env[Any, Any]):
 
 
 def dial_points(seen):
-    """The decision point of dials of which that is seen."""
+    """The decision point of dials with observations of that kind."""
     space, look = SEEN[seen]
     definition = define(
         agent="hand_0",

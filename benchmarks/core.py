@@ -16,7 +16,7 @@ from benchmarks.measure import MissingError, Table, measure, pin
 
 SECTIONS = (
     "decisions", "resets", "extras", "rounds", "plugins", "vector", "suspended", "many", "branches",
-    "episodes", "outside", "wolf_sheep", "energyplus", "experiments", "batch_run",
+    "episodes", "outside", "openenv", "wolf_sheep", "energyplus", "experiments", "batch_run",
 )  # fmt: skip
 """The sections in the order in which they run. Each is imported when it runs."""
 

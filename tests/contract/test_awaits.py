@@ -5,7 +5,6 @@ import gc
 import threading
 from contextlib import suppress
 from functools import partial
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -236,16 +235,14 @@ class Fifty(Council):
 
 
 @pytest.mark.parametrize("many", [1, 4])
-def test_fifty_asyncio_tasks_wait_for_coroutine_policies_as_long_as_one(many):
+def test_fifty_asyncio_tasks_wait_for_coroutine_policies_at_the_same_time(many):
     policy = counting(lambda number: 0.05)
 
     async def patient(observation, *, _decision):
         await policy(observation, _decision=_decision)
         return 1
 
-    start = perf_counter()
     simulate_many(Fifty, speaking(patient), seeds=range(many), points=POINTS)
-    assert perf_counter() - start < 0.2 * 50 * 0.05 * Fifty.rounds * many  # not one by one
     assert max(are_open for *_, are_open in policy.asked) >= 49
 
 

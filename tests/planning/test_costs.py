@@ -13,7 +13,7 @@ from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, costs
 from tests.worlds.saved import Pumps
 
 SAID = re.compile(
-    r"simenv_marl: (\d+) candidates x (\d+) futures x ([\d.]+ m?s) on \d+ cores?: about"
+    r"simenv_marl: (\d+) candidates x (\d+) futures? x ([\d.]+ m?s) on \d+ cores?: about"
     r" ([\d.]+ m?s) a decision, ([\d.]+ m?s) an episode"
 )
 
@@ -116,7 +116,7 @@ def test_reported_planning_time_of_replays_includes_the_past(method, seconds, mo
     monkeypatch.setattr(costs, "_time_future", lambda env, number, base: future)
     planner = RolloutPolicy([[0, 1], [1, 0]], futures=2, horizon=3, every=4, method=method)
     simulate_many(Slow, {"push": planner}, seeds=[1, 2])
-    assert f"3 candidates x 1 futures x {seconds} on " in capfd.readouterr().err
+    assert f"3 candidates x 1 future x {seconds} on " in capfd.readouterr().err
 
 
 def test_measuring_planning_time_does_not_change_results(monkeypatch, capfd):

@@ -64,7 +64,8 @@ def say_costs(
     episode = decision * future.decisions / task.every
     if episode * load.episodes / load.processes < LONG:
         return
-    futures = f"{candidates} candidates x {branches / candidates:.3g} futures"
+    each = branches / candidates
+    futures = f"{candidates} candidates x {each:.3g} future{'s' * (each != 1)}"
     at_least = "" if future.is_over else "more than "
     print(
         f"simenv_marl: {futures} x {_shown(seconds)} on {cores} core{'s' * (cores > 1)}: about"

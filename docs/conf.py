@@ -88,7 +88,7 @@ def _label(app, doctree):
                     cell[0].insert(0, nodes.inline("", f"{title}: ", classes=["label"]))
 
 
-def _enlarge(app, doctree):
+def _load_lazily(app, doctree):
     """Load figures when they come into view.
 
     A click shows one in its own size, because Sphinx links pictures that have a width. pages.css
@@ -170,7 +170,7 @@ def setup(app):
     app.connect("builder-inited", lambda app: write_notebooks(DOCS))
     app.connect("doctree-read", _trim)
     app.connect("doctree-read", _label)
-    app.connect("doctree-read", _enlarge)
+    app.connect("doctree-read", _load_lazily)
     app.connect("html-page-context", _list_sections)
     app.connect("autodoc-process-docstring", _shorten, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", _keep_colons, priority=400)  # the same

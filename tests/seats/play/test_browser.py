@@ -175,10 +175,10 @@ def test_play_page_lets_two_people_play_the_greenhouse(open_page, start, tmp_pat
     assert (code, err) == (0, "")
 
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line["action"] for line in lines if line.get("agent") and line["turn"] == 3] == [
-        [0.05],
-        [0.06],
+    actions = [
+        line["action"]["array"] for line in lines if "agent" in line and line["play"]["turn"] == 3
     ]
+    assert [action for [action] in actions] == pytest.approx([0.05, 0.06])
     found = replay(path, GreenhouseSim)
     assert found["ventilator_0"].returns[0] == pytest.approx(total, abs=0.01)
     assert found["waterer_0"].actions[:2, 0].tolist() == pytest.approx([0.05, 0.06])

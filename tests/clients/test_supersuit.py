@@ -8,7 +8,7 @@ import pettingzoo
 import pytest
 from gymnasium.spaces import Box
 from hive import BEES, DEFINITION, HiveSim
-from hive import dial_points as bees
+from hive import points as bees
 from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 

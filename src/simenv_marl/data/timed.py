@@ -9,12 +9,11 @@ times, the discount of an interval is ``info["discount"]``, with the option ``di
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
+from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 from stable_baselines3.common import buffers
 
@@ -27,7 +26,7 @@ except ImportError:
     masked = None
 
 
-def _discounts(infos: Sequence[Info]) -> list[float]:
+def _discounts(infos: list[Info]) -> list[float]:
     """Return the discounts in infos."""
     try:
         return [info["discount"] for info in infos]
@@ -36,11 +35,6 @@ def _discounts(infos: Sequence[Info]) -> list[float]:
             'the infos have no "discount"; give the environment discount_rate=, and the simulation'
             " a method time"
         ) from None
-
-
-def _space(name: str, place: int, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    """Return a space among the arguments of a buffer. None if the buffer is being unpickled."""
-    return kwargs.get(name, args[place] if len(args) > place else None)
 
 
 class TimedReplayBuffer(buffers.ReplayBuffer):
@@ -53,14 +47,13 @@ class TimedReplayBuffer(buffers.ReplayBuffer):
         discounts: The discounts, of shape ``(buffer_size, n_envs)``.
     """
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+    def __new__(
+        cls, buffer_size: int = 0, observation_space: Any = None, *_: Any, **__: Any
+    ) -> Any:
         """Make the buffer for a ``Dict``, if observations are one."""
-        kind: Any = cls
-        is_dict = isinstance(_space("observation_space", 1, args, kwargs), spaces.Dict)
-        if cls is TimedReplayBuffer and is_dict:
-            kind = _TimedDictReplayBuffer
-        made: Self = super().__new__(kind)
-        return made
+        if cls is TimedReplayBuffer and isinstance(observation_space, Dict):
+            return _TimedDictReplayBuffer.__new__(_TimedDictReplayBuffer)
+        return super().__new__(cls)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -89,8 +82,7 @@ class TimedReplayBuffer(buffers.ReplayBuffer):
         np.random.set_state(state)  # so that the samples are of the same environments
         samples = super()._get_samples(batch_inds, env)
         discounts = self.discounts[batch_inds, places].reshape(-1, 1)
-        *others, _ = samples
-        return type(samples)(*others, self.to_torch(discounts))
+        return samples._replace(discounts=self.to_torch(discounts))
 
 
 class TimedRolloutBuffer(buffers.RolloutBuffer):
@@ -103,16 +95,20 @@ class TimedRolloutBuffer(buffers.RolloutBuffer):
         discounts: The discounts, of shape ``(buffer_size, n_envs)``.
     """
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+    def __new__(
+        cls,
+        buffer_size: int = 0,
+        observation_space: Any = None,
+        action_space: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> Any:
         """Make the buffer for a ``Dict``, and for masks, if they are needed."""
         kind: Any = cls
         if cls is TimedRolloutBuffer:
-            is_dict = isinstance(_space("observation_space", 1, args, kwargs), spaces.Dict)
-            action_space = _space("action_space", 2, args, kwargs)
-            masks = masked is not None and not isinstance(action_space, spaces.Box)
-            kind = _ROLLOUT_BUFFERS.get((is_dict, masks), cls)
-        made: Self = super().__new__(kind)
-        return made
+            masks = masked is not None and not isinstance(action_space, Box)
+            kind = _ROLLOUT_BUFFERS.get((isinstance(observation_space, Dict), masks), cls)
+        return super().__new__(kind)
 
     def reset(self) -> None:
         """Begin a rollout."""
@@ -126,20 +122,21 @@ class TimedRolloutBuffer(buffers.RolloutBuffer):
             OptionValueError: The infos have no discount, or a learner collects in another way.
         """
         # Only the caller knows the infos. Its local variables are public: callbacks get them.
-        frame = inspect.currentframe()
-        caller = {} if frame is None or frame.f_back is None else frame.f_back.f_locals
+        frame: Any = inspect.currentframe()
+        caller = frame.f_back.f_locals
         if not {"infos", "dones", "self"} <= caller.keys():
             raise OptionValueError(
                 "TimedRolloutBuffer must be filled by collect_rollouts of Stable-Baselines3, where"
                 " it finds the infos"
             )
-        infos = caller["infos"]
-        discounts = np.array(_discounts(infos), np.float32)
-        self.discounts[self.pos] = discounts
-        for place, info in enumerate(infos):
+        policy = caller["self"].policy
+        self.discounts[self.pos] = discounts = np.array(_discounts(caller["infos"]), np.float32)
+        for place, info in enumerate(caller["infos"]):
             if caller["dones"][place] and info.get("TimeLimit.truncated", False):
-                value = _value(caller["self"].policy, info["terminal_observation"])
-                reward[place] += (discounts[place] - self.gamma) * value
+                last = policy.obs_to_tensor(info["terminal_observation"])[0]
+                with torch.no_grad():
+                    value = policy.predict_values(last).item()
+                reward[place] += (discounts[place] - self.gamma) * value  # it has gamma's already
         super().add(obs, action, reward, *others, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: Any, dones: Any) -> None:
@@ -151,12 +148,6 @@ class TimedRolloutBuffer(buffers.RolloutBuffer):
             error = self.rewards[step] + weights[step] * values[step + 1] - values[step]
             self.advantages[step] = advantage = error + self.gae_lambda * weights[step] * advantage
         self.returns = self.advantages + self.values
-
-
-def _value(policy: Any, observation: Any) -> float:
-    """Return the value of the last observation of a truncated episode, as the learner adds it."""
-    with torch.no_grad():
-        return float(policy.predict_values(policy.obs_to_tensor(observation)[0]))
 
 
 class _TimedDictReplayBuffer(TimedReplayBuffer, buffers.DictReplayBuffer):

@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, is_hypothesis_test, settings
 from simenv_marl.core.plans.options import Options
 from simenv_marl.core.switching import opened
 from tests import extent
-from tests.worlds.models import DRIVERS
 
 # A shell that starts the tests in the background has them ignore interrupts, which some are about.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -21,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def pytest_addoption(parser):
     parser.addoption(
         "--driver",
-        choices=(*DRIVERS, "both"),
+        choices=(*extent.DRIVERS, "both"),
         default="both",
         help="drivers to test the contract with",
     )

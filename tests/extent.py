@@ -1,7 +1,12 @@
-"""How many random examples a test tries: few in `make test`, all in `make test-thorough`."""
+"""How much is tested: with which drivers, how many random examples, and which cases.
+
+`make test` tries few examples, `make test-thorough` all of them.
+"""
 
 import pytest
 from hypothesis import settings
+
+DRIVERS = ("greenlet", "thread")
 
 QUICK = 0.1
 """The share of the examples that `--extent quick` leaves."""

@@ -1,6 +1,6 @@
 """The contract is tested with every driver."""
 
-from tests.worlds.models import DRIVERS
+from tests.extent import DRIVERS
 
 
 def pytest_generate_tests(metafunc):

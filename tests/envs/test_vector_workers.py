@@ -16,8 +16,9 @@ from gymnasium.vector import AsyncVectorEnv
 from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
 from tests.envs.test_vector import begun
+from tests.extent import DRIVERS
 from tests.processes import alone, descriptors, gone, python
-from tests.worlds.models import DRIVERS, fails, notes
+from tests.worlds.models import fails, notes
 from tests.worlds.vectors import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 
 pytestmark = [FORKS, pytest.mark.usefixtures("no_workers_left")]

@@ -23,6 +23,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
 from simenv_marl import RULE, aec_env, joint_env, make_step, parallel_env, single_env
+from tests.extent import DRIVERS
 
 
 def plainly(value):
@@ -236,7 +237,6 @@ def nobody_is_asked():
 VIEWS = (aec_env, parallel_env, joint_env, single_env)
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS)
 
-DRIVERS = ("greenlet", "thread")
 EVERY_DRIVER = pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
 """Environments are made with that driver, unless they are told otherwise."""
 BY_DRIVER = pytest.mark.parametrize("driver", DRIVERS)

@@ -82,7 +82,7 @@ class TimedReplayBuffer(buffers.ReplayBuffer):
         np.random.set_state(state)  # so that the samples are of the same environments
         samples = super()._get_samples(batch_inds, env)
         discounts = self.discounts[batch_inds, places].reshape(-1, 1)
-        return samples._replace(discounts=self.to_torch(discounts))
+        return type(samples)(*samples[:-1], self.to_torch(discounts))
 
 
 class TimedRolloutBuffer(buffers.RolloutBuffer):

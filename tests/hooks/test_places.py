@@ -129,6 +129,14 @@ def test_decision_point_name_can_be_a_private_method_as_written():
     assert _Hiding().look() == "hidden"
 
 
+STALL = SimpleNamespace(price=lambda: 1)
+
+
+def test_decision_point_name_of_an_objects_function_raises_patch_error():
+    with pytest.raises(PatchError, match="STALL is neither a class nor a module"):
+        resolve(f"{__name__}.STALL.price")
+
+
 def test_decision_point_name_raises_an_import_error_of_its_module(tmp_path, monkeypatch):
     (tmp_path / "broken_model.py").write_text("import no_such_package_at_all\n")
     (tmp_path / "raising_model.py").write_text("raise ZeroDivisionError\n")

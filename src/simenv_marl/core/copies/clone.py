@@ -297,7 +297,7 @@ def _call_in_forks(
                 forks.callback(fork.end, "")
                 running[fork.connection] = number, fork, time.monotonic() + time_limit
             oldest, _, deadline = next(iter(running.values()))
-            ready = wait(list(running), min(max(deadline - time.monotonic(), 0.0), PATIENCE))
+            ready = wait(running, min(max(deadline - time.monotonic(), 0.0), PATIENCE))
             if not ready:
                 for number, fork, _ in running.values():
                     if fork.is_stuck():

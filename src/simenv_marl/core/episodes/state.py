@@ -109,7 +109,7 @@ class UnmatchedNames:
     """The agents and functions that are named, and that no episode has had or called yet."""
 
     def __init__(self, names: frozenset[str]) -> None:
-        self._names = set(names)
+        self._names = names
         self._points: set[Hook] = set()  # whose removers were checked
 
     def check(self, episode: EpisodeState, called: Collection[Hook] | None) -> None:

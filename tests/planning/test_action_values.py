@@ -95,6 +95,18 @@ class Limited(Duel):
         return TRUNCATED
 
 
+def test_action_values_in_a_branch_return_the_answer_of_the_base():
+    def planned(env):
+        values = action_values(env, base=lambda observation: 2)
+        assert not values.counts.any()
+        return 1000.0 * values.best
+
+    options = {"horizon": 1, "futures": 1, "method": "replay"}
+    found = action_values(made("aec"), terminal_value=planned, **options)
+    plain = action_values(made("aec"), **options)
+    assert found.means - plain.means == pytest.approx([2000.0] * 3)
+
+
 @pytest.mark.thorough
 @METHODS
 @BY_DRIVER

@@ -6,6 +6,7 @@ Entry points are strings, so that specs can be serialised.
 import importlib
 import re
 import sys
+from collections.abc import Iterable
 from typing import Any, Final, Unpack
 
 import gymnasium
@@ -70,7 +71,7 @@ def register_simulation(
     entry_point = f"{__name__}:make_view"
     single = {point.hook.name: point for point in plan.active if point.agent or plan.one_agent}
     views: dict[str, dict[str, str | None]] = {}
-    for title, point in zip(_titles(list(single)), single.values(), strict=True):
+    for title, point in zip(_titles(single), single.values(), strict=True):
         views[title] = {"view": "single", "agent": point.agent or plan.one_agent}
         if point.agent is not None:  # the view has no other agents, and so no roster
             views[title] |= {"possible_agents": None, "undeclared": "error"}
@@ -98,7 +99,7 @@ def register_simulation(
     return ids
 
 
-def _titles(points: list[str]) -> list[str]:
+def _titles(points: Iterable[str]) -> list[str]:
     """Return the titles of decision points in ids.
 
     A title is the function's name in CamelCase; with its class, or all of the dotted name, if

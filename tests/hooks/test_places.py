@@ -129,6 +129,17 @@ def test_decision_point_name_can_be_a_private_method_as_written():
     assert _Hiding().look() == "hidden"
 
 
+class Till:
+    @staticmethod
+    def fee():
+        return 3
+
+
+def test_decorated_function_of_a_static_method_stays_a_static_method(monkeypatch):
+    monkeypatch.setattr(Till, "fee", define()(Till.fee))
+    assert Till.fee() == Till().fee() == 3
+
+
 STALL = SimpleNamespace(price=lambda: 1)
 
 

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, branch, joint_env, parallel_env
+from simenv_marl import RULE, SimulationInterface, branch, joint_env, parallel_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     ClosedError,
@@ -45,6 +45,36 @@ def acted(results):
 
 
 # -- the rule of rounds ---------------------------------------------------------------------------
+
+
+class Auction(SimulationInterface):
+    """Asks two bidders at each price, and tells the next price before."""
+
+    def reset(self, seed=None):
+        self.price = 0
+
+    def expected_calls(self, point):
+        return [(self, bidder, self.price) for bidder in ("ann", "bob")]
+
+    def run(self):
+        for self.price in (10, 20, 30):
+            for bidder in ("ann", "bob"):
+                self.bid(bidder, self.price)
+
+    def bid(self, bidder, price):
+        return 0
+
+
+def test_parallel_env_observes_expected_calls_in_each_round():
+    definition = define(
+        agent=lambda auction, bidder, price: bidder,
+        observation_space_mapping=lambda auction, bidder, price: [price, 0],
+    )
+    env = parallel_env(Auction, {Auction.bid: definition})
+    seen = [env.reset()[0]]
+    while env.agents:
+        seen.append(env.step(dict.fromkeys(env.agents, 0))[0])
+    assert [float(each["bob"][0]) for each in seen] == [10, 20, 30, 30]
 
 
 def test_parallel_env_observations_do_not_show_moves_of_the_same_step():

@@ -212,6 +212,16 @@ def test_fallback_policy_share_counts_only_decisions_of_the_wrapped_policy():
     }  # fmt: skip
 
 
+def test_evaluate_counts_the_seconds_until_a_coroutine_policy_has_answered():
+    async def slow(observation, *, _decision):
+        await asyncio.sleep(0.01)
+        return 1
+
+    found = evaluate(Tank, {"slow": {"filler": slow}}, seeds=[0], points=POINTS)
+    seats = found.seats.set_index("agent")
+    assert seats.loc["filler", "seconds"] >= 0.009 * seats.loc["filler", "decisions"]
+
+
 def test_evaluate_summary_marks_contenders_with_many_fallbacks():
     contenders = {
         "bad": {"filler": FallbackPolicy(raises)},

@@ -266,16 +266,18 @@ def registries_put_back():
 
 @contextmanager
 def models_of_pages_forgotten():
-    """Import the models of pages anew in the block, and forget them afterwards.
+    """Import the models of pages anew in the block, and forget that import afterwards.
 
-    Names of decision points would find the decorated functions of an earlier import as long as
-    these exist.
+    Names of decision points would find the decorated functions of another import as long as these
+    exist. Tests that have imported a model before go on with theirs.
     """
+    before = {name: sys.modules[name] for name in MODELS_OF_PAGES if name in sys.modules}
     _forget_models_of_pages()
     try:
         yield
     finally:
         _forget_models_of_pages()
+        sys.modules.update(before)
 
 
 def _forget_models_of_pages():

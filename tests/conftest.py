@@ -69,19 +69,21 @@ def pytest_report_header(config):
     )
 
 
-def is_in_extent(item, extent):
+def is_in_extent(item, chosen):
     """Whether a run of that extent has a test; both extents have the tests with random examples."""
     is_thorough = item.get_closest_marker("thorough") is not None
-    if extent == "quick":
+    if chosen == "quick":
         return not is_thorough
     return is_thorough or is_hypothesis_test(getattr(item, "obj", None))
 
 
 def pytest_collection_modifyitems(config, items):
     if config.option.extent != "all":
-        left_out = [item for item in items if not is_in_extent(item, config.option.extent)]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if is_in_extent(item, config.option.extent)]
+        parts = {True: [], False: []}
+        for item in items:
+            parts[is_in_extent(item, config.option.extent)].append(item)
+        config.hook.pytest_deselected(items=parts[False])
+        items[:] = parts[True]
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
         places = {

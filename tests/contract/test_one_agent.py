@@ -268,7 +268,7 @@ def test_skip_forced_adds_up_rewards_and_times_of_skipped_decisions():
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_skip_forced_asks_nobody_if_only_one_action_is_legal():
+def test_skip_forced_asks_no_policy_if_only_one_action_is_legal():
     asked = []
 
     def policy(observation, info):

@@ -259,7 +259,7 @@ def test_evaluate_gives_proportions_wilson_intervals():
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
 @pytest.mark.parametrize(("size", "power"), [(0.1, 0.5), (0.5, 0.8), (1.5, 0.99)])
-def test_evaluate_seeds_needed_are_those_of_a_paired_t_test(size, power, confidence):
+def test_evaluate_seeds_needed_match_a_paired_t_test(size, power, confidence):
     apart = np.random.default_rng(1).normal(size=20)
     found = Evaluation(of_teams(a=np.zeros(20), b=apart), "a", confidence)
     expected = TTestPower().solve_power(effect_size=size, alpha=1 - confidence, power=power)

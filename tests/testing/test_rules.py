@@ -97,7 +97,7 @@ def test_check_simulation_accepts_a_rule_that_draws_and_caches():
     sound(Lazy)
 
 
-def test_check_simulation_lets_apply_change_what_its_rule_changes():
+def test_check_simulation_lets_apply_change_the_same_state_as_the_rule():
     class Applied(Serves):
         pass
 

@@ -145,7 +145,7 @@ class UnmatchedNames:
             agents = [*episode.agents.values(), *episode.others.values(), *episode.ended.values()]
             counts = [agent.answered for agent in agents if agent.point.hook is point.hook]
             if not counts or max(counts) < min(counts) + 2:
-                continue  # as if nobody were removed: all have decided equally often
+                continue  # because agents that decide equally often were not removed
             self._points.add(point.hook)
             if hooks.isdisjoint(called):
                 names = sorted(hook.name for hook in hooks)
